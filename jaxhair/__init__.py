@@ -1,0 +1,1 @@
+"""Differentiable simulation of hair that keeps its shape through side-chain bonds."""

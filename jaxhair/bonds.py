@@ -1,0 +1,216 @@
+"""Side-chain bonds: the rest shape they make, what they remember, and how they break and re-form."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxhair import check
+from jaxhair import quaternion as quat
+from jaxhair.effects import BondEffect
+from jaxhair.pytree import pytree
+from jaxhair.rods import Rod
+from jaxhair.strands import BONDS, State
+
+
+@pytree
+class Bonds:
+    """Influence and first state of the four kinds: hydrogen, ionic, disulfide, peptide.
+
+    Arguments:
+        influence: f_j, what each kind holds when all of it is bonded; only ratios matter. Shape
+            (4,), or (strands, 4), or (strands, points - 2, 4).
+        fraction: b_j at the start, in [0, 1]; of the same shapes.
+
+    The defaults are the paper's table 1: hydrogen 33 %, with ionic 63 %, disulfide 20 %, peptide
+    17 %. Raises ValueError for influences below 0 or that sum to 0, and fractions outside [0, 1].
+    """
+
+    influence: Any = (0.33, 0.30, 0.20, 0.17)
+    fraction: Any = (1.0, 1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        for name in ("influence", "fraction"):
+            shape = np.shape(getattr(self, name))
+            if shape[-1:] != (len(BONDS),) or len(shape) > 3:
+                check.shape(f"bonds.{name}", getattr(self, name), (len(BONDS),))
+        check.not_negative("bonds.influence", self.influence)
+        check.fraction("bonds.fraction", self.fraction)
+        f = check.known(self.influence)
+        if f is not None and np.any(f.sum(axis=-1) <= 0):
+            raise ValueError(f"bonds.influence is {f.tolist()}; its sum must be above 0")
+
+
+def per_inner_point(x: Any) -> Array:
+    """Shape (4,), (strands, 4) or (strands, inner, 4) to (inner or 1, 4, strands or 1)."""
+    x = jnp.asarray(x)
+    x = x.reshape((1,) * (2 - x.ndim) + x.shape) if x.ndim < 2 else x
+    x = x[:, None] if x.ndim == 2 else x
+    return jnp.moveaxis(x, 0, -1)
+
+
+def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> Array:
+    """Omega_o = sum_j f_j {Omega_j + (1 - b_j)(Omega - Omega_j)} / sum_j f_j (Eq. 15).
+
+    Springs in parallel: Omega - Omega_o = sum_j f_j b_j (Omega - Omega_j) / sum_j f_j. For each
+    kind the present shape is first brought to the hemisphere of what that kind remembers.
+
+    Arguments:
+        shapes: Omega_j, shape (inner points, 4, 3, strands).
+        fractions: b_j, shape (inner points, 4, strands).
+        influence: f_j, shape (inner points or 1, 4, strands or 1).
+        r: conj(q1) q2, whose vector part is Omega, shape (inner points, 4, strands).
+    Returns Omega_o, shape (inner points, 3, strands).
+    """
+    share = influence / jnp.sum(influence, axis=1, keepdims=True)
+    omega = present_shape(r[:, None], shapes)
+    held = shapes + (1 - fractions)[:, :, None] * (omega - shapes)
+    return jnp.sum(share[:, :, None] * held, axis=1)
+
+
+def present_shape(r: Array, remembered: Array) -> Array:
+    """Omega, the vector part of r or of -r, whichever is nearer to a remembered shape.
+
+    Arguments:
+        r: conj(q1) q2, shape (..., 4, strands). remembered: Omega_j, shape (..., 3, strands).
+    """
+    return quat.same_hemisphere(r, quat.from_vector_part(remembered)) * r[..., 1:, :]
+
+
+def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
+    """Omega_j <- (b_j Omega_j + db_j Omega) / (b_j + db_j) where db_j > 0 (Eq. 16).
+
+    Arguments:
+        shape: Omega_j of one kind, shape (inner points, 3, strands).
+        fraction: b_j before the rise. rise: db_j; both of shape (inner points, strands).
+        r: conj(q1) q2, whose vector part is Omega, shape (inner points, 4, strands).
+    """
+    rises = rise > 0
+    new = jnp.where(rises, rise / jnp.where(rises, fraction + rise, 1), 0)[:, None]
+    return shape + new * (present_shape(r, shape) - shape)
+
+
+def kinds_formed(effects: Sequence[BondEffect]) -> tuple[int, ...]:
+    """Places, in `BONDS`, of the kinds that some effect may re-form."""
+    return tuple(j for j, kind in enumerate(BONDS) if any(kind in e.kinds_formed for e in effects))
+
+
+def changes(
+    effects: Sequence[BondEffect], rod: Rod, state: State, dt: float
+) -> tuple[Array, dict[int, Array]]:
+    """Fractions after this step's cutting, and the rises that its re-forming will add.
+
+    Falls come first and rises are kept for the end of the step, so that the stress of a bond
+    never jumps when it forms.
+
+    Returns fractions of shape (inner points, 4, strands), and for each kind (its place in
+    `BONDS`) that may rise, the rise, shape (inner points, strands).
+    """
+    fractions = state.fractions
+    rises: dict[int, Array] = {}
+    for j, kind in enumerate(BONDS):
+        before = state.fractions[:, j]
+        after = before
+        for effect in (e for e in effects if kind in e.kinds_cut):
+            change = effect.fraction_change(kind, before, rod, state, dt)
+            after = after + jnp.minimum(change, 0)
+        if any(kind in e.kinds_cut for e in effects):
+            after = jnp.maximum(after, 0)
+            fractions = fractions.at[:, j].set(after)
+        rise = jnp.zeros_like(before)
+        for effect in (e for e in effects if kind in e.kinds_formed):
+            rise = rise + jnp.maximum(effect.fraction_change(kind, before, rod, state, dt), 0)
+        if any(kind in e.kinds_formed for e in effects):
+            rises[j] = jnp.minimum(rise, 1 - after)
+    return fractions, rises
+
+
+def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
+    """The state after its bonds re-formed and remember the present shape."""
+    shapes, fractions = state.shapes, state.fractions
+    for j, rise in rises.items():
+        new = remembered(shapes[:, j], fractions[:, j], rise, r)
+        shapes = shapes.at[:, j].set(new)
+        fractions = fractions.at[:, j].add(rise)
+    return State(state.positions, state.velocities, state.orientations, shapes, fractions)
+
+
+class _Toward(BondEffect):
+    """Moves the fractions of the named kinds toward a value, at once or at a rate."""
+
+    hydrogen: Any
+    ionic: Any
+    disulfide: Any
+    peptide: Any
+    rate: Any
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        for kind in self._kinds():
+            check.fraction(f"{name}.{kind}", getattr(self, kind))
+        if not self._kinds():
+            raise ValueError(f"{name} names no bond; it must name one of {', '.join(BONDS)}")
+        if self.rate is not None:
+            check.not_negative(f"{name}.rate", self.rate)
+
+    def _kinds(self) -> tuple[str, ...]:
+        return tuple(kind for kind in BONDS if getattr(self, kind) is not None)
+
+    def fraction_change(
+        self, kind: str, fraction: Array, rod: Rod, state: State, dt: float
+    ) -> Array:
+        """What is missing to the wanted fraction, limited by the rate."""
+        change = getattr(self, kind) - fraction
+        return change if self.rate is None else jnp.clip(change, -self.rate * dt, self.rate * dt)
+
+
+@pytree
+class Cut(_Toward):
+    """Breaks bonds: fractions above the given ones fall to them.
+
+    Arguments:
+        hydrogen, ionic, disulfide, peptide: fraction that stays, in [0, 1]; None leaves a kind
+            alone, and then nothing of it is computed.
+        rate: largest fall in a second [1/s]; None cuts at once.
+    """
+
+    hydrogen: Any = None
+    ionic: Any = None
+    disulfide: Any = None
+    peptide: Any = None
+    rate: Any = None
+
+    @property
+    def kinds_cut(self) -> tuple[str, ...]:
+        return self._kinds()
+
+    @property
+    def kinds_formed(self) -> tuple[str, ...]:
+        return ()
+
+
+@pytree
+class Reform(_Toward):
+    """Re-forms bonds: fractions below the given ones rise to them and remember the present shape.
+
+    Arguments:
+        hydrogen, ionic, disulfide, peptide: fraction to reach, in [0, 1]; None leaves a kind
+            alone, and then nothing of it is computed.
+        rate: largest rise in a second [1/s]; None re-forms at once.
+    """
+
+    hydrogen: Any = None
+    ionic: Any = None
+    disulfide: Any = None
+    peptide: Any = None
+    rate: Any = None
+
+    @property
+    def kinds_cut(self) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def kinds_formed(self) -> tuple[str, ...]:
+        return self._kinds()

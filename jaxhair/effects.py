@@ -1,0 +1,104 @@
+"""The kinds of effects a phase can have, by what they change.
+
+A phase of a scene lists its effects in a tuple. The step asks each for what its kind gives; what
+is not in the tuple is not traced and leaves no operation behind. To add an effect, make a frozen
+dataclass with `jaxhair.pytree` that derives from one or more of these classes.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, TypeVar
+
+from jax import Array
+
+if TYPE_CHECKING:
+    from jaxhair.rods import Rod
+    from jaxhair.strands import State
+
+
+T = TypeVar("T")
+
+
+class Effect:
+    """Anything a phase can list."""
+
+
+def of_kind(effects: Iterable[Effect], kind: type[T]) -> tuple[T, ...]:
+    """The effects of one kind, in their order."""
+    return tuple(effect for effect in effects if isinstance(effect, kind))
+
+
+class VelocityEffect(Effect):
+    """Changes velocities: gravity, wind, drag, hair against hair."""
+
+    @abstractmethod
+    def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
+        """Change of velocity [m/s] over a step, shape (points, 3, strands)."""
+
+
+class PositionEffect(Effect):
+    """Changes predicted positions: obstacles."""
+
+    @abstractmethod
+    def projected(
+        self, rod: "Rod", positions: Array, previous: Array, time: Array, dt: float
+    ) -> Array:
+        """Predicted positions [m] made admissible, shape (points, 3, strands).
+
+        Arguments:
+            previous: positions before the step. time: of the step's start, within the phase [s].
+        """
+
+
+class HoldingEffect(Effect):
+    """Takes points and edges out of the solver's hands and moves them itself."""
+
+    @abstractmethod
+    def held_points(self, rod: "Rod") -> Array:
+        """True at held points, shape (points, 1, strands or 1)."""
+
+    @abstractmethod
+    def held_edges(self, rod: "Rod") -> Array:
+        """True at held edges, shape (edges, 1, strands or 1)."""
+
+    @abstractmethod
+    def moved(
+        self, rod: "Rod", positions: Array, orientations: Array, time: Array, dt: float
+    ) -> tuple[Array, Array]:
+        """Positions and orientations after a step, with the held ones where they belong."""
+
+
+class PoseEffect(Effect):
+    """Prescribes the whole pose, so that nothing moves by itself: hair fixed on a rod."""
+
+    @abstractmethod
+    def pose(self, rod: "Rod", positions: Array, orientations: Array) -> tuple[Array, Array]:
+        """The prescribed positions and orientations."""
+
+
+class BondEffect(Effect):
+    """Breaks or re-forms bonds."""
+
+    @property
+    @abstractmethod
+    def kinds_cut(self) -> tuple[str, ...]:
+        """The kinds of bonds whose fraction it may lower."""
+
+    @property
+    @abstractmethod
+    def kinds_formed(self) -> tuple[str, ...]:
+        """The kinds of bonds whose fraction it may raise."""
+
+    @abstractmethod
+    def fraction_change(
+        self, kind: str, fraction: Array, rod: "Rod", state: "State", dt: float
+    ) -> Array:
+        """Change of one kind's bonded fraction over a step, shape (inner points, strands)."""
+
+
+class StiffnessEffect(Effect):
+    """Changes the fibre's stiffness while it acts."""
+
+    @abstractmethod
+    def scaled(self, stiffness: Array) -> Array:
+        """The stiffness under this effect, same shape."""

@@ -1,0 +1,168 @@
+"""Quaternion algebra on arrays of shape (..., 4, strands): component order w x y z, strands last.
+
+Vectors have shape (..., 3, strands). A quaternion and its negative are the same rotation.
+All functions work in any floating dtype and are safe in value and derivative at zero.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+
+def dot(a: Array, b: Array) -> Array:
+    """a . b over the component axis, which is kept with size 1."""
+    return jnp.sum(a * b, axis=-2, keepdims=True)
+
+
+def safe_norm(x: Array) -> Array:
+    """|x| over the component axis (kept with size 1); its derivative at x = 0 is 0, not NaN."""
+    square = dot(x, x)
+    zero = square == 0
+    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
+
+
+def unit(x: Array) -> Array:
+    """x / |x| over the component axis; 0 where x = 0, with derivative 0 there."""
+    square = dot(x, x)
+    zero = square == 0
+    return x * jnp.where(zero, 0, lax.rsqrt(jnp.where(zero, 1, square)))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a x b over the component axis."""
+    a1, a2, a3 = (a[..., i, :] for i in range(3))
+    b1, b2, b3 = (b[..., i, :] for i in range(3))
+    return jnp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=-2)
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Hamilton product a b: the rotation b followed by the rotation a."""
+    aw, ax, ay, az = (a[..., i, :] for i in range(4))
+    bw, bx, by, bz = (b[..., i, :] for i in range(4))
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-2,
+    )
+
+
+def multiply_vector(q: Array, v: Array) -> Array:
+    """Hamilton product q (0, v)."""
+    w, x, y, z = (q[..., i, :] for i in range(4))
+    a, b, c = (v[..., i, :] for i in range(3))
+    return jnp.stack(
+        [
+            -x * a - y * b - z * c,
+            w * a + y * c - z * b,
+            w * b - x * c + z * a,
+            w * c + x * b - y * a,
+        ],
+        axis=-2,
+    )
+
+
+def conjugate(q: Array) -> Array:
+    """(w, -x, -y, -z): the inverse of a unit quaternion."""
+    return jnp.concatenate([q[..., :1, :], -q[..., 1:, :]], axis=-2)
+
+
+def relative(q1: Array, q2: Array) -> Array:
+    """conj(q1) q2: the rotation from the frame of q1 to the frame of q2, seen in q1."""
+    aw, ax, ay, az = (q1[..., i, :] for i in range(4))
+    bw, bx, by, bz = (q2[..., i, :] for i in range(4))
+    return jnp.stack(
+        [
+            aw * bw + ax * bx + ay * by + az * bz,
+            aw * bx - ax * bw - ay * bz + az * by,
+            aw * by + ax * bz - ay * bw - az * bx,
+            aw * bz - ax * by + ay * bx - az * bw,
+        ],
+        axis=-2,
+    )
+
+
+def tangent(q: Array) -> Array:
+    """R(q) e3, the direction of an edge whose frame is q, with e3 = (0, 0, 1)."""
+    w, x, y, z = (q[..., i, :] for i in range(4))
+    return jnp.stack(
+        [2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], axis=-2
+    )
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """R(q) v for a unit quaternion."""
+    axis = q[..., 1:, :]
+    twice = 2 * cross(axis, v)
+    return v + q[..., :1, :] * twice + cross(axis, twice)
+
+
+def from_rotation_vector(v: Array) -> Array:
+    """exp(v / 2): the rotation by |v| radians about v, exact and smooth at v = 0."""
+    half = safe_norm(v) / 2
+    return jnp.concatenate([jnp.cos(half), v * (jnp.sinc(half / jnp.pi) / 2)], axis=-2)
+
+
+def between(a: Array, b: Array) -> Array:
+    """Shortest rotation that takes the unit vector a to the unit vector b.
+
+    Where b = -a any half turn will do; one about an axis perpendicular to a is taken.
+    """
+    w = 1 + dot(a, b)
+    opposite = w < 1e-6
+    least = jnp.argmin(jnp.abs(a), axis=-2, keepdims=True)
+    helper = (jnp.arange(3)[:, None] == least).astype(a.dtype)
+    q = jnp.concatenate([w, cross(a, b)], axis=-2)
+    half_turn = jnp.concatenate([jnp.zeros_like(w), cross(a, helper)], axis=-2)
+    return unit(jnp.where(opposite, half_turn, q))
+
+
+def vector_multiply(v: Array, q: Array) -> Array:
+    """Hamilton product (0, v) q."""
+    w, x, y, z = (q[..., i, :] for i in range(4))
+    a, b, c = (v[..., i, :] for i in range(3))
+    return jnp.stack(
+        [
+            -x * a - y * b - z * c,
+            w * a + b * z - c * y,
+            w * b + c * x - a * z,
+            w * c + a * y - b * x,
+        ],
+        axis=-2,
+    )
+
+
+def from_vector_part(vector: Array) -> Array:
+    """The unit quaternion with a given vector part v and real part sqrt(1 - |v|^2) >= 0.
+
+    |v| may pass 1 by rounding. No derivative is taken through the real part: it only serves to
+    compare hemispheres.
+    """
+    real = jnp.sqrt(jnp.maximum(1 - dot(vector, vector), 0))
+    return jnp.concatenate([lax.stop_gradient(real), vector], axis=-2)
+
+
+def same_hemisphere(a: Array, b: Array) -> Array:
+    """+1 or -1: the sign that brings the unit quaternion a to the hemisphere of b.
+
+    Piecewise constant, so its derivative is 0.
+    """
+    along = dot(lax.stop_gradient(a), lax.stop_gradient(b))
+    return jnp.where(along >= 0, 1, -1).astype(a.dtype)
+
+
+def swept_products(first: Array, factors: Array) -> Array:
+    """first, first f_0, first f_0 f_1, ...: frames along a strand from its relative rotations.
+
+    first: shape (4, strands); factors: shape (edges - 1, 4, strands). Returns (edges, 4, strands).
+    """
+
+    def advance(q: Array, factor: Array) -> tuple[Array, Array]:
+        q = unit(multiply(q, factor))
+        return q, q
+
+    _, rest = jax.lax.scan(advance, first, factors)
+    return jnp.concatenate([first[None], rest])

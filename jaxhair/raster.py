@@ -1,0 +1,153 @@
+"""Cameras and a z-buffer for triangles and lines. Plain NumPy, no graphics driver.
+
+Places on an image are in pixels: x to the right, y downwards, the centre of the first pixel at
+(0.5, 0.5). A z-buffer is an array of unsigned 64-bit integers, shape (height * width,): in the
+upper half of an entry the bits of the depth, in the lower half the name of what is seen there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+NOTHING = 0xFFFFFFFF  # the name of what is seen where nothing is
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera.
+
+    position: [m], shape (3,).
+    axes: unit vectors to the right, downwards and forwards, the rows of a (3, 3) array.
+    focal: focal length in pixels.
+    size: width and height of the image in pixels.
+    """
+
+    position: Array
+    axes: Array
+    focal: float
+    size: tuple[int, int]
+
+    def project(self, points: Array) -> Array:
+        """Homogeneous places (x w, y w, w) of `points`, both of shape (..., 3); w is depth [m]."""
+        offset = np.array([[self.focal, 0, 0], [0, self.focal, 0], [*self.half, 1]])
+        matrix = (self.axes.T @ offset).astype(np.float32)
+        return (points - self.position).astype(np.float32) @ matrix
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """The place that the camera looks at, in pixels."""
+        return self.size[0] / 2, self.size[1] / 2
+
+    def unproject(self, x: Array, y: Array, depth: Array) -> Array:
+        """The points [m], shape (n, 3), at the places x, y and depths [m] of shape (n,)."""
+        rays = np.stack([(x - self.half[0]), (y - self.half[1])], -1) / np.float32(self.focal)
+        rays = np.concatenate([rays, np.ones((len(rays), 1), np.float32)], -1)
+        return (self.position + depth[:, None] * (rays @ self.axes.astype(np.float32))).astype(
+            np.float32
+        )
+
+
+def axes_towards(azimuth: float, elevation: float) -> Array:
+    """Axes of a camera that stands in the direction (azimuth, elevation) [rad] and looks back."""
+    (ca, sa), (ce, se) = (np.cos(azimuth), np.sin(azimuth)), (np.cos(elevation), np.sin(elevation))
+    right, forward = np.array([-sa, ca, 0.0]), -np.array([ce * ca, ce * sa, se])
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _key(depth: Array, identity: Array) -> Array:
+    """Depth above, identity below: the smaller of two keys is the nearer surface.
+
+    The bits of positive floats have the order of the floats, so one `np.minimum.at` both tests
+    depth and keeps what was seen.
+    """
+    bits = np.ascontiguousarray(depth, np.float32).view(np.uint32).astype(np.uint64)
+    return (bits << np.uint64(32)) | identity.astype(np.uint64)
+
+
+def depth_of(keys: Array) -> Array:
+    return (keys >> np.uint64(32)).astype(np.uint32).view(np.float32)
+
+
+def empty_buffer(camera: Camera) -> Array:
+    far = np.full(1, np.finfo(np.float32).max, np.float32)
+    return np.repeat(_key(far, np.array([NOTHING])), camera.size[0] * camera.size[1])
+
+
+def triangles(camera: Camera, corners: Array, near: float) -> Array:
+    """Z-buffer, shape (height * width,), of triangles with `corners` [m], shape (m, 3, 3).
+
+    Olano and Greer (1997): with the homogeneous corners as rows of M, (x, y, 1) M^-1 are the
+    barycentric coordinates over depth. They are all positive inside, on this side of the eye
+    only, so nothing has to be clipped.
+    """
+    buffer = empty_buffer(camera)
+    v = camera.project(corners).astype(np.float64)
+    inverse = np.stack([np.cross(v[:, (k + 1) % 3], v[:, (k + 2) % 3]) for k in range(3)], -1)
+    volume = np.sum(v[:, 0] * inverse[..., 0], -1)
+    scale = np.prod(np.linalg.norm(v, axis=-1), -1)
+    width, height = camera.size
+    whole = np.any(v[..., 2] <= near, -1)
+    flat = v[..., :2] / np.where(whole[:, None], 1.0, v[..., 2])[..., None]
+    edge = np.array([width, height])
+    low = np.where(whole[:, None], 0, np.clip(np.floor(flat.min(1)), 0, edge)).astype(int)
+    high = np.where(whole[:, None], edge, np.clip(np.ceil(flat.max(1)), 0, edge)).astype(int)
+    seen = np.all(high > low, -1) & (abs(volume) > 1e-12 * scale) & np.any(v[..., 2] > near, -1)
+    inverse /= np.where(seen, volume, 1.0)[:, None, None]
+    span = np.max(high - low, -1)
+    block = np.where(span <= 64, 2 ** np.ceil(np.log2(np.maximum(span, 1))), 0).astype(int)
+    # Many small triangles at a time, in blocks of one size; large ones one by one.
+    for size in np.unique(block[seen]):
+        which = np.flatnonzero(seen & (block == size))
+        step = max(1, 2**20 // size**2) if size else 1
+        for start in range(0, len(which), step):
+            few = which[start : start + step]
+            spans = (size, size) if size else tuple(high[few[0]] - low[few[0]])
+            x = low[few, 0, None] + np.arange(spans[0])
+            y = low[few, 1, None] + np.arange(spans[1])
+            m = inverse[few].astype(np.float32)[:, None, None]
+            fx, fy = (x + np.float32(0.5))[:, None, :], (y + np.float32(0.5))[:, :, None]
+            fx, fy = fx.astype(np.float32), fy.astype(np.float32)
+            weights = [fx * m[..., 0, k] + (fy * m[..., 1, k] + m[..., 2, k]) for k in range(3)]
+            inside = (weights[0] >= 0) & (weights[1] >= 0) & (weights[2] >= 0)
+            per_depth = weights[0] + weights[1] + weights[2]
+            inside &= (per_depth > 0) & (per_depth < 1 / near)
+            inside &= (x < width)[:, None, :] & (y < height)[:, :, None]
+            place = np.broadcast_to(y[:, :, None] * width + x[:, None, :], inside.shape)[inside]
+            name = np.broadcast_to(few[:, None, None], inside.shape)[inside]
+            np.minimum.at(buffer, place, _key(1 / per_depth[inside], name))
+    return buffer
+
+
+def lines(camera: Camera, start: Array, end: Array, buffer: Array, bias: float) -> None:
+    """Draw lines, one sample a pixel, into `buffer` in place.
+
+    start, end: homogeneous places of the ends, shape (n, 3). What is seen is named by 64 i + k
+    for line i at the fraction k / 63 of its length.
+    bias: [m] by which a line is drawn nearer than it is.
+    """
+    width, height = camera.size
+    near = max(bias, 1e-6) * 2
+    kept = np.flatnonzero((start[:, 2] > near) & (end[:, 2] > near))
+    a = start[kept, :2] / start[kept, 2:]
+    b = end[kept, :2] / end[kept, 2:]
+    limit = np.array([width, height], np.float32)
+    onscreen = np.all((np.maximum(a, b) >= 0) & (np.minimum(a, b) < limit), -1)
+    kept, a, b = kept[onscreen], a[onscreen], b[onscreen]
+    samples = np.ceil(np.max(np.abs(b - a), -1)).astype(np.int64).clip(1, 4 * max(width, height))
+    chunk = np.cumsum(samples) // 2**21
+    for piece in range(int(chunk[-1]) + 1 if len(chunk) else 0):
+        few = slice(*np.searchsorted(chunk, [piece, piece + 1]))
+        n, lines = samples[few], kept[few]
+        first = np.cumsum(n) - n
+        row = np.repeat(np.arange(len(n)), n)
+        along = (np.arange(len(row)) - first[row] + 0.5).astype(np.float32) / n[row]
+        xy = a[few][row] + along[:, None] * (b[few] - a[few])[row]
+        depth = start[lines, 2][row] + along * (end[lines, 2] - start[lines, 2])[row] - bias
+        ok = np.all((xy >= 0) & (xy < limit), -1)
+        cell = xy.astype(np.int64)
+        place = cell[:, 1] * width + cell[:, 0]
+        name = lines[row] * 64 + (along * 63).astype(np.int64)
+        np.minimum.at(buffer, place[ok], _key(depth[ok], name[ok]))
+
+

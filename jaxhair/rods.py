@@ -1,0 +1,154 @@
+"""Cosserat rods in position-based dynamics: the constraints of one strand, (Eq. 1) to (Eq. 11).
+
+After Kugelstadt and Schoemer, Position and Orientation Based Cosserat Rods, 2016
+(DOI 10.2312/sca.20161234). Arrays have the strands last; component axes have size 3 or 4, and
+weights have size 1 there.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxhair import quaternion as quat
+from jaxhair.pytree import pytree, static
+
+
+@pytree
+class Rod:
+    """What stays the same of all strands during a phase.
+
+    Arguments:
+        lengths: rest lengths of the edges [m], shape (points - 1, 1, strands or 1).
+        point_weights: inverse masses, relative to a free point's: 1, and 0 where a point is held
+            or missing; shape (points, 1, strands or 1).
+        edge_weights: 1 where an edge may turn, 0 where it is held or missing; shape
+            (points - 1, 1, strands or 1).
+        stiffness: k at the inner points, shape (points - 2, 1, strands or 1).
+        influence: f_j, shape (inner points or 1, 4, strands or 1).
+        ragged: some strands have fewer points; their missing edges have rest length 0.
+    """
+
+    lengths: Array
+    point_weights: Array
+    edge_weights: Array
+    stiffness: Array
+    influence: Array
+    ragged: bool = static(default=False)
+
+    def edge_exists(self) -> Array:
+        """True at edges that are there, shape (points - 1, 1, strands or 1)."""
+        return self.lengths > 0
+
+    def point_exists(self) -> Array:
+        """True at points that are there, shape (points, 1, strands or 1)."""
+        there = self.edge_exists()
+        return jnp.concatenate([jnp.ones_like(there[:1]), there])
+
+    def distance(self) -> Array:
+        """Arc length from the root to each inner point [m], shape (points - 2, 1, ...)."""
+        return jnp.cumsum(self.lengths, axis=0)[:-1]
+
+    def tangents(self, positions: Array) -> Array:
+        """Unit vector of the edge that starts at each point; the tip has its last edge's.
+
+        positions [m] and the result: shape (points, 3, strands).
+        """
+        t = quat.unit(positions[1:] - positions[:-1])
+        tip = jnp.concatenate([t, t[-1:]])
+        if not self.ragged:
+            return tip
+        before = jnp.concatenate([t[:1], t])
+        missing = ~jnp.concatenate([self.edge_exists(), self.edge_exists()[-1:]])
+        return jnp.where(missing, before, tip)
+
+
+def _share(part: Array, whole: Array) -> Array:
+    """part / whole, and 0 where the whole is 0 because everything is held."""
+    none = whole == 0
+    return jnp.where(none, 0, part / jnp.where(none, 1, whole))
+
+
+def stretch_shear_factors(w1: Array, w2: Array, wq: Array, length: Array) -> tuple[Array, ...]:
+    """The factors of gamma in the corrections of p1 (Eq. 2), p2 (Eq. 3) and q (Eq. 4).
+
+    w1 l / D, w2 l / D and 2 wq l^2 / D with D = w1 + w2 + 4 wq l^2. The 2 of the last is missing
+    in print; it comes from the derivative of R(q) e3, and with it one projection takes a small
+    violation away to second order.
+
+    Arguments:
+        w1, w2: inverse masses of the two points. wq: of the edge's frame [1/m^2].
+        length: l [m].
+    """
+    whole = w1 + w2 + 4 * wq * length**2
+    return (
+        _share(w1 * length, whole),
+        _share(w2 * length, whole),
+        _share(2 * wq * length**2, whole),
+    )
+
+
+def stretch_shear_violation(p1: Array, p2: Array, q: Array, length: Array) -> Array:
+    """C_s = gamma = (p2 - p1) / l - R(q) e3 (Eq. 1, Eq. 5)."""
+    return (p2 - p1) / length - quat.tangent(q)
+
+
+def stretch_shear(
+    p1: Array, p2: Array, q: Array, length: Array, factors: tuple[Array, ...]
+) -> tuple[Array, Array, Array]:
+    """One projection of stretch and shear: p1 + g1 gamma, p2 - g2 gamma, unit(q + gq gamma q conj(e)).
+
+    Arguments:
+        p1, p2: ends of an edge [m], shape (..., 3, strands). q: its frame, (..., 4, strands).
+        length: l [m]. factors: of `stretch_shear_factors`.
+    """
+    g1, g2, gq = factors
+    gamma = stretch_shear_violation(p1, p2, q, length)
+    w, x, y, z = (q[..., i, :] for i in range(4))
+    q_conj_e = jnp.stack([z, -y, x, -w], axis=-2)
+    turn = quat.vector_multiply(gq * gamma, q_conj_e)
+    return p1 + g1 * gamma, p2 - g2 * gamma, quat.unit(q + turn)
+
+
+def bend_twist_factors(w1: Array, w2: Array, stiffness: Array) -> tuple[Array, Array]:
+    """The factors of (Omega - s Omega_o) in the corrections of q1 (Eq. 9) and q2 (Eq. 10).
+
+    k' w1 / (w1 + w2) and k' w2 / (w1 + w2).
+
+    Arguments:
+        w1, w2: inverse inertias of the two frames. stiffness: k', of one iteration.
+    """
+    return _share(stiffness * w1, w1 + w2), _share(stiffness * w2, w1 + w2)
+
+
+def darboux(q1: Array, q2: Array) -> Array:
+    """conj(q1) q2 (Eq. 8), whose vector part is Omega. The real part is kept for (Eq. 7)."""
+    return quat.relative(q1, q2)
+
+
+def bend_twist_violation(r: Array, rest: Array) -> Array:
+    """C_b = Omega - s Omega_o (Eq. 6), with s = +1 or -1, whichever is nearer (Eq. 7, Eq. 11).
+
+    s compares the whole relative quaternion, real part included. By vector parts alone, as
+    printed, a rest shape of +0.05 and a present one of -0.05 would need no correction.
+
+    Arguments:
+        r: conj(q1) q2, shape (..., 4, strands).
+        rest: the unit quaternion whose vector part is Omega_o, shape (..., 4, strands).
+    """
+    return (r - quat.same_hemisphere(r, rest) * rest)[..., 1:, :]
+
+
+def bend_twist(
+    q1: Array, q2: Array, rest: Array, factors: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """One projection of bend and twist: unit(q1 + h1 q2 C), unit(q2 - h2 q1 C).
+
+    Arguments:
+        q1, q2: frames of neighbouring edges, shape (..., 4, strands).
+        rest: the unit quaternion whose vector part is Omega_o, shape (..., 4, strands).
+        factors: of `bend_twist_factors`.
+    """
+    h1, h2 = factors
+    c = bend_twist_violation(darboux(q1, q2), rest)
+    new1 = quat.unit(q1 + quat.multiply_vector(q2, h1 * c))
+    new2 = quat.unit(q2 - quat.multiply_vector(q1, h2 * c))
+    return new1, new2

@@ -1,0 +1,188 @@
+"""A scene: strands, their fibre and bonds, and the phases that they go through. Plain data."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhair import check
+from jaxhair.bonds import Bonds
+from jaxhair.effects import Effect, of_kind
+from jaxhair.fibre import Fibre
+from jaxhair.holding import Wound
+from jaxhair.pytree import pytree, static
+from jaxhair.solvers import PositionBased
+from jaxhair.strands import Strands
+
+@pytree
+class Phase:
+    """A stretch of time in which the same effects act.
+
+    Arguments:
+        name: by which the phase's end is found in results, and its numbers in `named_leaves`.
+        duration: [s]; rounded to whole time steps, at least one.
+        effects: what acts on the hair. What is not listed here is not computed.
+    """
+
+    name: str = static()
+    duration: float = static()
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name or "." in self.name:
+            raise ValueError(f"phase.name is {self.name!r}; it must be a text without '.'")
+        check.shape(f"phase {self.name!r}.duration", self.duration, ())
+        check.positive(f"phase {self.name!r}.duration", self.duration)
+        object.__setattr__(self, "duration", float(self.duration))
+        object.__setattr__(self, "effects", tuple(self.effects))
+        for effect in self.effects:
+            if not isinstance(effect, Effect):
+                raise ValueError(
+                    f"phase {self.name!r}.effects has {effect!r}; each must be an effect"
+                )
+
+    def steps(self, dt: float) -> int:
+        """Number of time steps."""
+        return max(1, round(self.duration / dt))
+
+
+@pytree
+class Scene:
+    """All that a simulation needs.
+
+    Arguments:
+        strands: the hair as it starts. fibre: its stiffness. bonds: their influence.
+        phases: what happens, in order; names must differ.
+        solver: of the strands' elasticity.
+        dt: time step [s].
+
+    Every number is a leaf of the pytree, to be traced, differentiated and fitted; counts and
+    choices are static. Computation is done in the dtype of `strands.positions`.
+    """
+
+    strands: Strands
+    fibre: Fibre = Fibre()
+    bonds: Bonds = Bonds()
+    phases: tuple[Phase, ...] = ()
+    solver: PositionBased = PositionBased()
+    dt: float = static(default=1 / 360)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "phases", tuple(self.phases))
+        object.__setattr__(self, "dt", float(self.dt))
+        check.positive("scene.dt", self.dt)
+        names = [phase.name for phase in self.phases]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"scene.phases has {name!r} twice; names must differ")
+        self._check_bonds()
+        self._check_rods()
+
+    def _check_bonds(self) -> None:
+        strands, inner = self.strands.count, self.strands.points - 2
+        for name in ("influence", "fraction"):
+            value = getattr(self.bonds, name)
+            if len(np.shape(value)) > 1:
+                allowed = (strands, 4) if len(np.shape(value)) == 2 else (strands, inner, 4)
+                check.shape(f"bonds.{name}", value, allowed)
+        for name in ("stiffness", "cuticle_share", "peeling_rate"):
+            if np.shape(getattr(self.fibre, name)) not in ((), (1,), (strands,)):
+                check.shape(f"fibre.{name}", getattr(self.fibre, name), (strands,))
+
+    def _check_rods(self) -> None:
+        longest = check.known(self.strands.lengths)
+        for phase in self.phases:
+            for wound in of_kind(phase.effects, Wound):
+                diameter = check.known(wound.diameter)
+                if longest is not None and diameter is not None and longest.max() >= diameter:
+                    raise ValueError(
+                        f"phase {phase.name!r}: Wound.diameter is {float(diameter):g} m and the "
+                        f"longest edge {longest.max():g} m; the edges must be shorter than the "
+                        "rod is thick: take more points on a strand"
+                    )
+
+    @property
+    def dtype(self) -> Any:
+        """Of the computation: that of the strands' positions."""
+        return jnp.asarray(self.strands.positions).dtype
+
+    @property
+    def duration(self) -> float:
+        """Simulated time of all phases [s]."""
+        return sum(phase.steps(self.dt) for phase in self.phases) * self.dt
+
+    def then(self, *phases: Phase) -> "Scene":
+        """This scene with further phases behind its own."""
+        return replace(self, phases=(*self.phases, *phases))
+
+    def phase(self, name: str) -> Phase:
+        """The phase of a name. Raises ValueError if there is none."""
+        for phase in self.phases:
+            if phase.name == name:
+                return phase
+        listed = ", ".join(repr(phase.name) for phase in self.phases)
+        raise ValueError(f"phase is {name!r}; it must be one of {listed}")
+
+    def as_arrays(self) -> "Scene":
+        """This scene with every number as an array of the scene's dtype."""
+        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), self)
+
+    def __str__(self) -> str:
+        size = f"{self.strands.count} strands of {self.strands.points} points"
+        lines = [f"{size}, dt {self.dt:g} s", f"  {self.fibre}", f"  {self.bonds}", f"  {self.solver}"]
+        for phase in self.phases:
+            lines.append(f"  {phase.name}: {phase.steps(self.dt)} steps")
+            lines += [f"    {effect}" for effect in phase.effects]
+        return "\n".join(lines)
+
+
+def named_leaves(scene: Scene) -> dict[str, Any]:
+    """Every number of a scene by its name, such as "bonds.influence" or "phases.wind.Gravity.acceleration".
+
+    An effect goes by its class; where a phase has several of one class, the second is "Hold2".
+    """
+    leaves, _ = jax.tree_util.tree_flatten_with_path(scene)
+    return {_name(path, scene): leaf for path, leaf in leaves}
+
+
+def replace_leaves(scene: Scene, values: dict[str, Any]) -> Scene:
+    """The scene with some leaves, by name, replaced. Nothing is checked, so values may be traced.
+
+    Raises ValueError for a name that the scene does not have.
+    """
+    names = named_leaves(scene)
+    for name in values:
+        if name not in names:
+            raise ValueError(f"leaf is {name!r}; it must be one of {', '.join(names)}")
+    return jax.tree_util.tree_map_with_path(
+        lambda path, leaf: values.get(_name(path, scene), leaf), scene
+    )
+
+
+def _name(path: tuple[Any, ...], scene: Scene) -> str:
+    return ".".join(_parts(path, scene))
+
+
+def _parts(path: tuple[Any, ...], scene: Scene) -> Iterator[str]:
+    """Names along a path into a scene; tuples are entered by phase name and effect class."""
+    here: Any = scene
+    inside_phase: Phase | None = None
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            here = getattr(here, key.name)
+            if key.name != "effects":
+                yield key.name
+            continue
+        item = here[key.idx] if isinstance(here, list | tuple) else None
+        if isinstance(item, Phase):
+            inside_phase = item
+            yield item.name
+        elif isinstance(item, Effect) and inside_phase is not None:
+            alike = [type(e) for e in inside_phase.effects[: key.idx]].count(type(item))
+            yield type(item).__name__ + ("" if alike == 0 else str(alike + 1))
+        else:
+            yield str(key.idx)
+        here = item

@@ -1,0 +1,297 @@
+"""How hair is lit: Kajiya-Kay shading, soft shadows, and the image put together.
+
+Colours are linear RGB until `srgb`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxhair import raster
+from jaxhair.raster import Array, Camera
+
+Mesh = tuple[Array, Array]
+
+SUPERSAMPLING = 2
+MESH_COLOR = np.array([0.50, 0.47, 0.45], np.float32)
+BACKGROUND = np.array([[0.80, 0.82, 0.84], [0.55, 0.56, 0.57]], np.float32)  # top, bottom
+BONDED_COLORS = np.array([[0.03, 0.10, 0.85], [0.85, 0.04, 0.03]], np.float32)  # at 0, at 1
+
+
+def kajiya_kay(tangent: Array, to_light: Array, to_eye: Array, power: float) -> tuple[Array, Array]:
+    """Light scattered by a thin fibre, after Kajiya and Kay (1989).
+
+    Diffuse: sin(t, l). Specular: cos(a)^power with a the angle between the eye and the cone into
+    which a cylinder reflects, cos(a) = sin(t, l) sin(t, e) - (t.l)(t.e), where l and e both
+    point away from the fibre. All three arguments are unit vectors of shape (..., 3).
+    """
+    along_light = np.sum(tangent * to_light, -1)
+    along_eye = np.sum(tangent * to_eye, -1)
+    diffuse = np.sqrt(np.clip(1 - along_light**2, 0, 1))
+    sin_eye = np.sqrt(np.clip(1 - along_eye**2, 0, 1))
+    cone = np.clip(diffuse * sin_eye - along_light * along_eye, 0, 1)
+    return diffuse, cone**power
+
+
+def bonded_color(bonded: Array) -> Array:
+    """Blue at 0 to red at 1, shape (..., 3)."""
+    return BONDED_COLORS[0] + bonded[..., None] * (BONDED_COLORS[1] - BONDED_COLORS[0])
+
+
+def srgb(linear: Array) -> Array:
+    """Linear RGB as bytes for a screen."""
+    x = np.clip(linear, 0, 1)
+    curve = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    return np.round(255 * curve).astype(np.uint8)
+
+
+def linear(color: Array) -> Array:
+    """Linear RGB of a screen colour in [0, 1]."""
+    x = np.asarray(color, np.float32)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _sample(grid: Array, *places: Array) -> Array:
+    """Multilinear look-up in `grid` at places in cells (the first centre at 0), clamped."""
+    result = np.zeros(places[0].shape, grid.dtype)
+    lower = []
+    for axis, place in enumerate(places):
+        p = np.clip(place, 0, grid.shape[axis] - 1.001)
+        floor = p.astype(np.int32)
+        lower.append((floor, (p - floor).astype(np.float32)))
+    flat = grid.ravel()
+    for corner in range(2 ** len(places)):
+        weight: Array | float = 1.0
+        index: Array | int = 0
+        for axis, (floor, rest) in enumerate(lower):
+            up = corner >> axis & 1
+            index = index * grid.shape[axis] + floor + up
+            weight = weight * (rest if up else 1 - rest)
+        result += flat[index] * weight
+    return result
+
+
+def _blur(grid: Array) -> Array:
+    """Binomial blur over the first two axes."""
+    for axis in (0, 1):
+        grid = (np.roll(grid, 1, axis) + 2 * grid + np.roll(grid, -1, axis)) / 4
+    return grid
+
+
+class Shadows:
+    """Light that gets through the hair and past the meshes to a point.
+
+    The hair is a cloud in front of the light, its optical depth summed layer by layer (deep
+    opacity maps, Yuksel and Keyser 2008); a mesh hides what lies behind it by exponential shadow
+    maps (Annen et al. 2008), which blur without many samples.
+    """
+
+    LAYERS, CELL, SHARPNESS = 32, 4, 600.0
+
+    def __init__(
+        self, light: Camera, points: Array, lengths: Array, width: float, corners: Array
+    ) -> None:
+        """points [m], shape (n, 3), each stands for a hair of `lengths` [m] and `width` [m]."""
+        self.light = light
+        places = light.project(points)
+        depth = places[:, 2]
+        self.front = float(depth.min())
+        self.layer = max(float(depth.max()) - self.front, 1e-6) / (self.LAYERS - 3)
+        cells = (light.size[1] // self.CELL, light.size[0] // self.CELL, self.LAYERS)
+        column, row, layer = (
+            np.clip(np.round(p).astype(np.int64), 0, n - 1)
+            for p, n in zip(self._cells(places), (cells[1], cells[0], cells[2]), strict=True)
+        )
+        area = (np.mean(depth) / light.focal * self.CELL) ** 2
+        cloud = np.bincount(
+            (row * cells[1] + column) * cells[2] + layer, lengths * width / area, np.prod(cells)
+        )
+        cloud = _blur(cloud.reshape(cells))
+        self.cloud = (np.cumsum(cloud, -1) - cloud).astype(np.float32)
+        self.total = np.ascontiguousarray(cloud.sum(-1).astype(np.float32))
+        self.hidden: Array | None = None
+        if len(corners):
+            buffer = raster.triangles(light, corners, 0.05 * self.front)
+            first = np.exp(self._relative(raster.depth_of(buffer).astype(np.float64)))
+            self.hidden = _blur(_blur(first.reshape(light.size[::-1])))
+
+    def _relative(self, depth: Array) -> Array:
+        return self.SHARPNESS * (np.minimum(depth / self.front, 2) - 1)
+
+    def _cells(self, places: Array) -> tuple[Array, Array, Array]:
+        x, y = (places[:, k] / places[:, 2] / self.CELL - 0.5 for k in (0, 1))
+        return x, y, (places[:, 2] - self.front) / self.layer + 1
+
+    def light_at(self, points: Array, *, on_hair: bool) -> Array:
+        """The part of the light in [0, 1], shape (n,), that reaches `points` [m], (n, 3)."""
+        places = self.light.project(points)
+        x, y, layer = self._cells(places)
+        if on_hair:
+            thickness = _sample(self.cloud, y, x, layer)
+        else:
+            behind = np.clip(layer / self.LAYERS * 4 - 0.5, 0, 1)
+            thickness = _sample(self.total, y, x) * behind
+        result = np.exp(-thickness)
+        if self.hidden is not None:
+            # A hair that touches a surface is not behind it.
+            depth = places[:, 2] * np.float64(0.996 if on_hair else 1.0)
+            seen = _sample(self.hidden, self.CELL * y + 1.5, self.CELL * x + 1.5)
+            result *= np.minimum(seen * np.exp(-self._relative(depth)), 1)
+        return np.asarray(result, np.float32)
+
+
+@dataclass(frozen=True)
+class Hairs:
+    """Smooth lines to draw.
+
+    points: [m], shape (hairs, vertices, 3).
+    tangents: unit vectors along the hairs, the same shape.
+    colors: linear RGB, the same shape.
+    drawn: which of the edges between vertices to draw, shape (hairs, vertices - 1).
+    width: [m] that the eye takes one drawn hair for.
+    """
+
+    points: Array
+    tangents: Array
+    colors: Array
+    drawn: Array
+    width: float
+
+
+class Surfaces:
+    """All triangles of a scene, with normals that vary over the round parts.
+
+    corners: [m], shape (triangles, 3, 3).
+    """
+
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
+        corners, normals, slopes = [np.zeros((0, 3, 3))], [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
+        for vertices, triangles in meshes:
+            corner = vertices[triangles]
+            cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+            mean = np.zeros_like(vertices)
+            np.add.at(mean, triangles.ravel(), np.repeat(cross, 3, 0))
+            face, mean = _unit(cross)[:, None], _unit(mean)[triangles]
+            # A round surface is shaded round; an edge stays sharp.
+            normal = np.where(np.sum(face * mean, -1, keepdims=True) > 0.8, mean, face)
+            opposite = np.roll(corner, -2, 1) - np.roll(corner, -1, 1)
+            twice = np.maximum(np.linalg.norm(cross, axis=-1), 1e-30)[:, None, None]
+            gradient = np.cross(face, opposite) / twice  # of the barycentric coordinates
+            corners.append(corner)
+            normals.append(normal[:, 0])
+            slopes.append(np.einsum("mki,mkj->mij", normal, gradient))
+        self.corners = np.concatenate(corners)
+        self._normals = np.concatenate(normals).astype(np.float32)
+        self._slopes = np.concatenate(slopes).astype(np.float32)
+
+    def normals_at(self, points: Array, which: Array) -> Array:
+        """Unit normals, shape (n, 3), at `points` [m] of the triangles `which`."""
+        normals = self._normals[which]
+        round_ = np.flatnonzero(np.any(self._slopes != 0, (1, 2))[which])
+        offset = points[round_] - self.corners[which[round_], 0].astype(np.float32)
+        normals[round_] += np.einsum("nij,nj->ni", self._slopes[which[round_]], offset)
+        return _unit(normals)
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+
+
+def background(size: tuple[int, int]) -> Array:
+    """A quiet gradient, shape (height, width, 3)."""
+    down = np.linspace(0, 1, size[1], dtype=np.float32)[:, None, None]
+    return np.broadcast_to(BACKGROUND[0] * (1 - down) + BACKGROUND[1] * down, (*size[::-1], 3))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where the eye and the light stand.
+
+    centre: [m], shape (3,), and radius [m]: of what is shown; surfaces fade away outside it.
+    """
+
+    camera: Camera
+    light: Camera
+    centre: Array
+    radius: float
+
+
+def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
+    """The image, linear RGB of shape (height, width, 3)."""
+    camera, light, radius = stage.camera, stage.light, stage.radius
+    fine = Camera(
+        camera.position,
+        camera.axes,
+        camera.focal * SUPERSAMPLING,
+        (camera.size[0] * SUPERSAMPLING, camera.size[1] * SUPERSAMPLING),
+    )
+    edges = np.linalg.norm(np.diff(hairs.points, axis=1), axis=-1) * hairs.drawn
+    lengths = np.pad(edges, ((0, 0), (0, 1))) / 2 + np.pad(edges, ((0, 0), (1, 0))) / 2
+    vertices = hairs.points.reshape(-1, 3)
+    shadows = Shadows(light, vertices, lengths.ravel(), hairs.width, surfaces.corners)
+
+    image = background(fine.size).reshape(-1, 3).copy()
+    if len(surfaces.corners):
+        buffer = raster.triangles(fine, surfaces.corners, 0.02 * radius)
+        _paint_surfaces(image, buffer, fine, stage, surfaces, shadows)
+        buffer |= np.uint64(raster.NOTHING)
+    else:
+        buffer = raster.empty_buffer(fine)
+
+    places = fine.project(hairs.points)
+    starts, ends = places[:, :-1][hairs.drawn], places[:, 1:][hairs.drawn]
+    raster.lines(fine, starts, ends, buffer, 0.01 * radius)
+    colors = _lit_hairs(camera, light, hairs, shadows)
+    names = (buffer & np.uint64(raster.NOTHING)).astype(np.int64)
+    seen = np.flatnonzero(names != raster.NOTHING)
+    line, along = np.divmod(names[seen], 64)
+    mix = (along / np.float32(63))[:, None].astype(np.float32)
+    first, last = colors[:, :-1][hairs.drawn], colors[:, 1:][hairs.drawn]
+    image[seen] = first[line] * (1 - mix) + last[line] * mix
+
+    s = SUPERSAMPLING
+    return image.reshape(camera.size[1], s, camera.size[0], s, 3).mean((1, 3))
+
+
+def _lit_hairs(camera: Camera, light: Camera, hairs: Hairs, shadows: Shadows) -> Array:
+    """Colours of the vertices as seen, shape (hairs, vertices, 3)."""
+    to_eye = _unit(camera.position - hairs.points).astype(np.float32)
+    lit = shadows.light_at(hairs.points.reshape(-1, 3), on_hair=True)
+    lit = lit.reshape(hairs.points.shape[:2])
+    diffuse, glint = kajiya_kay(hairs.tangents, -light.axes[2].astype(np.float32), to_eye, 40.0)
+    # Light from behind the camera, so that no side of a lock is black.
+    fill, _ = kajiya_kay(hairs.tangents, -camera.axes[2].astype(np.float32), to_eye, 1.0)
+    body = 0.10 + 0.22 * fill * (0.35 + 0.65 * lit) + 0.95 * diffuse * lit
+    color: Array = hairs.colors * body[..., None] + (0.22 * glint * lit)[..., None]
+    return color
+
+
+def _paint_surfaces(
+    image: Array,
+    buffer: Array,
+    camera: Camera,
+    stage: Stage,
+    surfaces: Surfaces,
+    shadows: Shadows,
+) -> None:
+    names = (buffer & np.uint64(raster.NOTHING)).astype(np.int64)
+    seen = np.flatnonzero(names != raster.NOTHING)
+    if not len(seen):
+        return
+    which, depth = names[seen], raster.depth_of(buffer[seen])
+    y, x = np.divmod(seen, camera.size[0])
+    x, y = (x + 0.5).astype(np.float32), (y + 0.5).astype(np.float32)
+    points = camera.unproject(x, y, depth)
+    normals = surfaces.normals_at(points, which)
+    to_eye = _unit(camera.position.astype(np.float32) - points)
+    normals *= np.sign(np.sum(normals * to_eye, -1, keepdims=True))
+    to_light = -stage.light.axes[2].astype(np.float32)
+    lit = shadows.light_at(points, on_hair=False)
+    ambient = 0.34 + 0.14 * normals[:, 2]
+    value = ambient + 0.95 * np.clip(normals @ to_light, 0, 1) * lit
+    color = MESH_COLOR * value[:, None]
+    away = np.linalg.norm(points - stage.centre.astype(np.float32), axis=-1) / stage.radius
+    fade = np.clip((away - 1.5) / 3.5, 0, 1)[:, None]
+    fade = fade * fade * (3 - 2 * fade)
+    image[seen] = color * (1 - fade) + image[seen] * fade

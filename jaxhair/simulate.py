@@ -1,0 +1,169 @@
+"""The step, and the loops that repeat it."""
+
+import math
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jaxhair import bonds as bond
+from jaxhair import rods
+from jaxhair.effects import (
+    BondEffect,
+    Effect,
+    HoldingEffect,
+    PoseEffect,
+    PositionEffect,
+    StiffnessEffect,
+    VelocityEffect,
+    of_kind,
+)
+from jaxhair.fibre import stiffness
+from jaxhair.pytree import pytree, static
+from jaxhair.quaternion import from_vector_part
+from jaxhair.rods import Rod
+from jaxhair.scene import Phase, Scene
+from jaxhair.solvers import PositionBased
+from jaxhair.strands import State, strands_last
+
+
+@pytree
+class Setup:
+    """What a step needs besides the state: the same for all steps of a phase."""
+
+    rod: Rod
+    effects: tuple[Effect, ...]
+    solver: PositionBased
+    dt: float = static()
+
+
+def step(setup: Setup, state: State, time: Array) -> State:
+    """One time step, in the order of the paper's figure 1.
+
+    Arguments:
+        setup: of the phase, from `prepare`.
+        state: at the start of the step.
+        time: of the step's start, within the phase [s], shape ().
+    """
+    rod, effects, dt = setup.rod, setup.effects, setup.dt
+    p, q, v = state.positions, state.orientations, state.velocities
+    # 1. External forces, and the bonds that break. 2a. Interactions that change velocities.
+    fractions, rises = bond.changes(of_kind(effects, BondEffect), rod, state, dt)
+    for effect in of_kind(effects, VelocityEffect):
+        v = v + effect.velocity_change(rod, state, dt)
+
+    if of_kind(effects, PoseEffect):
+        for effect in of_kind(effects, PoseEffect):
+            p, q = effect.pose(rod, p, q)
+        v = jnp.zeros_like(v)
+    else:
+        # 2b. Prediction; held points move; obstacles.
+        p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
+        for effect in of_kind(effects, HoldingEffect):
+            p, q = effect.moved(rod, p, q, time, dt)
+        for effect in of_kind(effects, PositionEffect):
+            p = effect.projected(rod, p, state.positions, time, dt)
+        # 3. The rest shape that the bonds make.
+        r = rods.darboux(q[:-1], q[1:])
+        rest = bond.rest_shape(state.shapes, fractions, rod.influence, r)
+        # 4. Elasticity, and the velocity that follows from it.
+        p, q = setup.solver.solve(rod, p, q, from_vector_part(rest))
+        v = (p - state.positions) / dt
+    state = State(p, v, q, state.shapes, fractions)
+    # 5. The bonds that re-form remember the present shape.
+    if rises:
+        state = bond.reformed(state, rises, rods.darboux(q[:-1], q[1:]))
+    return state
+
+
+def prepare(scene: Scene, phase: Phase) -> Setup:
+    """What stays the same during a phase."""
+    strands = scene.strands
+    lengths = strands_last(strands.lengths)[:, None]
+    ones = jnp.ones((strands.points, 1, 1), lengths.dtype)
+    rod = Rod(
+        lengths=lengths,
+        point_weights=ones,
+        edge_weights=ones[1:],
+        stiffness=ones[2:],
+        influence=bond.per_inner_point(scene.bonds.influence),
+        ragged=strands.ragged,
+    )
+    points_free, edges_free = jnp.ones_like(ones, bool), jnp.ones_like(ones[1:], bool)
+    if strands.ragged:
+        points_free, edges_free = rod.point_exists(), rod.edge_exists()
+    for effect in of_kind(phase.effects, HoldingEffect):
+        points_free = points_free & ~effect.held_points(rod)
+        edges_free = edges_free & ~effect.held_edges(rod)
+    k = stiffness(scene.fibre, rod.distance())
+    for soft in of_kind(phase.effects, StiffnessEffect):
+        k = jnp.clip(soft.scaled(k), 0, 1)
+    rod = Rod(
+        lengths=lengths,
+        point_weights=points_free.astype(lengths.dtype),
+        edge_weights=edges_free.astype(lengths.dtype),
+        stiffness=k,
+        influence=rod.influence,
+        ragged=strands.ragged,
+    )
+    return Setup(rod, phase.effects, scene.solver, scene.dt)
+
+
+def start(scene: Scene) -> State:
+    """The state before the first step: at rest, every bond remembering the natural shape."""
+    positions = strands_last(scene.strands.positions)
+    shape = strands_last(scene.strands.natural_shape)
+    shapes = jnp.broadcast_to(shape[:, None], (shape.shape[0], 4, *shape.shape[1:]))
+    fractions = bond.per_inner_point(scene.bonds.fraction)
+    return State(
+        positions,
+        jnp.zeros_like(positions),
+        strands_last(scene.strands.orientations),
+        shapes,
+        jnp.broadcast_to(fractions, (shape.shape[0], 4, shape.shape[2])),
+    )
+
+
+def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> State:
+    """The state after `steps` steps, of which the first has the number `first` in its phase.
+
+    Two nested scans: in reverse mode about 2 sqrt(steps) states are stored, and each step is
+    computed a second and third time instead.
+    """
+
+    def one(state: State, number: Array) -> tuple[State, None]:
+        return step(setup, state, number.astype(state.positions.dtype) * setup.dt), None
+
+    def many(state: State, numbers: Array) -> tuple[State, None]:
+        return lax.scan(jax.checkpoint(one, prevent_cse=False), state, numbers)
+
+    numbers = first + jnp.arange(steps)
+    inner = _near_square_root(steps)
+    outer = steps // inner
+    blocks = numbers[: outer * inner].reshape(outer, inner)
+    state, _ = lax.scan(jax.checkpoint(many, prevent_cse=False), state, blocks)
+    if outer * inner < steps:
+        state, _ = many(state, numbers[outer * inner :])
+    return state
+
+
+def _near_square_root(steps: int) -> int:
+    """A divisor near the square root, so that no steps are left over, or else the root itself."""
+    root = math.isqrt(steps)
+    for size in range(root, max(root // 4, 1) - 1, -1):
+        if steps % size == 0:
+            return size
+    return root
+
+
+def run(scene: Scene) -> dict[str, State]:
+    """The state at the end of each phase, by the phase's name.
+
+    A pure function: `jax.jit`, `grad`, `jvp` and `vmap` work on it, in any leaf of the scene.
+    """
+    scene = scene.as_arrays()
+    state = start(scene)
+    ends = {}
+    for phase in scene.phases:
+        state = advance(prepare(scene, phase), state, 0, steps=phase.steps(scene.dt))
+        ends[phase.name] = state
+    return ends

@@ -1,0 +1,250 @@
+"""Strands of hair: their geometry as a user gives it, and their state during a simulation.
+
+A user's arrays have the strands first: (strands, points, 3). Inside, a `State` has them last,
+(points, 3, strands), which makes a step 4 to 5 times faster: neighbouring strands then fill the
+lanes of the processor's vector registers.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxhair import check
+from jaxhair import quaternion as quat
+from jaxhair.pytree import pytree, static
+
+BONDS = ("hydrogen", "ionic", "disulfide", "peptide")
+"""The kinds of side-chain bonds, in the order of every array that has an axis of bonds."""
+
+
+def strands_last(x: Any) -> Array:
+    """(strands, ...) to (..., strands)."""
+    return jnp.moveaxis(jnp.asarray(x), 0, -1)
+
+
+def strands_first(x: Any) -> Array:
+    """(..., strands) to (strands, ...)."""
+    return jnp.moveaxis(x, -1, 0)
+
+
+def per_strand(x: Any) -> Array:
+    """A number, or one for each strand, as an array of shape (1, 1, strands or 1)."""
+    return jnp.reshape(jnp.asarray(x), (1, 1, -1))
+
+
+def column(vector: Any, like: Array) -> Array:
+    """A 3-vector in shape (1, 3, 1) and the dtype of an array of shape (points, 3, strands)."""
+    return jnp.reshape(jnp.asarray(vector, like.dtype), (1, 3, 1))
+
+
+@pytree
+class Strands:
+    """The strands of a scene as they start and as they want to be.
+
+    A strand has points and, between them, edges. The frame of an edge is a unit quaternion q
+    (w x y z) whose R(q) e3 points along the edge, from root to tip. `natural_shape` is the vector
+    part of conj(q_i) q_(i+1), half the sine of the bend and twist from an edge to the next: what
+    all bonds remember before any treatment. Make one with `from_points`
+    or `straight`.
+
+    Arguments:
+        positions: points [m], shape (strands, points, 3); at least two points.
+        orientations: frames of the edges, unit quaternions, shape (strands, points - 1, 4).
+        lengths: rest lengths of the edges [m], shape (strands, points - 1), or
+            (1, points - 1) where all strands share them.
+        natural_shape: shape (strands, points - 2, 3), norm at most 1.
+        ragged: strands have different numbers of points. A missing edge has rest length 0.
+
+    Raises ValueError where a shape, a length, a quaternion or a natural shape is not as above.
+    """
+
+    positions: Any
+    orientations: Any
+    lengths: Any
+    natural_shape: Any
+    ragged: bool = static(default=False)
+
+    def __post_init__(self) -> None:
+        check.shape("strands.positions", self.positions, ("strands", "points", 3))
+        strands, points, _ = np.shape(self.positions)
+        if points < 2:
+            raise ValueError(f"strands.positions has {points} point a strand; it must have 2 or more")
+        check.finite("strands.positions", self.positions)
+        check.shape("strands.orientations", self.orientations, (strands, points - 1, 4))
+        check.finite("strands.orientations", self.orientations)
+        rows = 1 if np.shape(self.lengths)[:1] == (1,) else strands
+        check.shape("strands.lengths", self.lengths, (rows, points - 1))
+        if self.ragged:
+            check.not_negative("strands.lengths", self.lengths)
+        else:
+            check.positive("strands.lengths", self.lengths)
+        if np.shape(self.natural_shape) != (strands, points - 2, 3):
+            check.shape("strands.natural_shape", self.natural_shape, (strands, points - 2, 3))
+        check.finite("strands.natural_shape", self.natural_shape)
+        self._check_norms()
+
+    def _check_norms(self) -> None:
+        q = check.known(self.orientations)
+        if q is not None and np.any(np.abs(np.linalg.norm(q, axis=-1) - 1) > 1e-3):
+            worst = np.linalg.norm(q, axis=-1).ravel()
+            worst = worst[np.argmax(np.abs(worst - 1))]
+            raise ValueError(f"strands.orientations has a norm of {worst}; it must be 1")
+        shape = check.known(self.natural_shape)
+        if shape is not None and shape.size:
+            norm = np.linalg.norm(shape, axis=-1).max()
+            if norm > 1 + 1e-6:
+                raise ValueError(f"strands.natural_shape has a norm of {norm}; it must be at most 1")
+
+    @property
+    def count(self) -> int:
+        """Number of strands."""
+        return int(np.shape(self.positions)[0])
+
+    @property
+    def points(self) -> int:
+        """Number of points of the longest strand."""
+        return int(np.shape(self.positions)[1])
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Number of points of each strand, shape (strands,). Needs known lengths."""
+        edges = (np.asarray(self.lengths) > 0).sum(axis=1)
+        return np.asarray(np.broadcast_to(edges + 1, (self.count,)))
+
+    @staticmethod
+    def from_points(points: Any, *, counts: Any = None) -> "Strands":
+        """Strands through given points, which are also their natural shape.
+
+        The frames are carried along without twist (parallel transport) from the root, whose frame
+        is the shortest rotation from e3 to the first edge.
+
+        Arguments:
+            points: [m], shape (strands, points, 3). Float32 or float64 is kept.
+            counts: points of each strand where they differ, shape (strands,); what stands
+                behind a strand's last point is ignored.
+
+        Raises ValueError for a wrong shape, a value that is not finite, a count outside
+        [2, points] or two neighbouring points that coincide.
+        """
+        check.shape("points", points, ("strands", "points", 3))
+        positions = jnp.asarray(points)
+        if not jnp.issubdtype(positions.dtype, jnp.floating):
+            positions = positions.astype(jnp.zeros(()).dtype)
+        strands, size, _ = positions.shape
+        if size < 2:
+            raise ValueError(f"points has {size} point a strand; it must have 2 or more")
+        ragged = counts is not None
+        if ragged:
+            n = np.asarray(counts)
+            check.shape("counts", n, (strands,))
+            if n.dtype.kind not in "iu" or np.any((n < 2) | (n > size)):
+                raise ValueError(f"counts is {n!r}; each must be a whole number in [2, {size}]")
+            last = jnp.asarray(np.minimum(np.arange(size), n[:, None] - 1))
+            positions = jnp.take_along_axis(positions, last[..., None], axis=1)
+        check.finite("points", positions)
+        x = strands_last(positions)
+        edges = x[1:] - x[:-1]
+        lengths = quat.safe_norm(edges)
+        exists = None
+        if ragged:
+            exists = jnp.asarray(np.arange(size - 1)[:, None, None] < n - 1)
+        _check_apart(lengths, exists)
+        tangents = quat.unit(edges)
+        if exists is not None:  # missing edges go straight on, which keeps their frames unit
+            tangents = _carried(tangents, exists)
+        turns = quat.between(tangents[:-1], tangents[1:])
+        root = quat.between(_e3_like(tangents[0]), tangents[0])
+        frames = [root]
+        for turn in turns:
+            frames.append(quat.unit(quat.multiply(turn, frames[-1])))
+        q = jnp.stack(frames)
+        r = quat.relative(q[:-1], q[1:])
+        shape = r[:, 1:] * jnp.where(r[:, :1] < 0, -1, 1).astype(r.dtype)
+        return Strands(
+            positions,
+            strands_first(q),
+            strands_first(lengths[:, 0]),
+            strands_first(shape),
+            ragged,
+        )
+
+    @staticmethod
+    def straight(
+        roots: Any, directions: Any, *, length: float, points: int, dtype: Any = None
+    ) -> "Strands":
+        """Straight strands of equal length.
+
+        Arguments:
+            roots: first points [m], shape (strands, 3).
+            directions: from root to tip, shape (strands, 3) or (3,), not zero.
+            length: of a strand [m]. points: on a strand, 2 or more.
+            dtype: float32 or float64; JAX's default if not given.
+        """
+        check.shape("roots", roots, ("strands", 3))
+        check.finite("roots", roots)
+        if np.shape(directions) != (3,):
+            check.shape("directions", directions, np.shape(roots))
+        check.positive("length", length)
+        check.whole("points", points, least=2)
+        dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+        start = strands_last(jnp.asarray(roots, dtype))
+        toward = np.broadcast_to(np.asarray(directions, dtype), np.shape(roots))
+        t = quat.unit(strands_last(toward))
+        along = jnp.linspace(0.0, length, points).astype(dtype)
+        x = start[None] + along[:, None, None] * t[None]
+        q = quat.between(_e3_like(t), t)
+        q = jnp.broadcast_to(q[None], (points - 1, *q.shape))
+        lengths = jnp.full((1, points - 1), length / (points - 1), dtype)
+        shape = jnp.zeros((t.shape[-1], points - 2, 3), dtype)
+        return Strands(strands_first(x), strands_first(q), lengths, shape)
+
+
+def _e3_like(t: Array) -> Array:
+    return jnp.zeros_like(t).at[2].set(1)
+
+
+def _carried(tangents: Array, exists: Array) -> Array:
+    """Tangents (edges, 3, strands) in which missing edges repeat the one before."""
+    rows = [tangents[0]]
+    for t, there in zip(tangents[1:], exists[1:], strict=True):
+        rows.append(jnp.where(there, t, rows[-1]))
+    return jnp.stack(rows)
+
+
+def _check_apart(lengths: Array, exists: Array | None) -> None:
+    known = check.known(lengths)
+    if known is None:
+        return
+    there = np.ones(known.shape, bool) if exists is None else np.asarray(exists)
+    if np.any(wrong := (known <= 0) & there):
+        edge, _, strand = (int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"points {edge} and {edge + 1} of strand {strand} coincide; "
+            "neighbouring points must be apart"
+        )
+
+
+@pytree
+class State:
+    """All that changes during a simulation; strands on the last axis.
+
+    Arguments:
+        positions: p [m], shape (points, 3, strands).
+        velocities: v [m/s], shape (points, 3, strands).
+        orientations: q of the edges, shape (points - 1, 4, strands).
+        shapes: what each kind of bond remembers, Omega_j, shape (points - 2, 4, 3, strands).
+        fractions: bonded fraction b_j of each kind in [0, 1], shape (points - 2, 4, strands).
+    """
+
+    positions: Array
+    velocities: Array
+    orientations: Array
+    shapes: Array
+    fractions: Array
+
+    @property
+    def points(self) -> Array:
+        """Positions [m] with the strands first, shape (strands, points, 3)."""
+        return strands_first(self.positions)
