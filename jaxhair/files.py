@@ -69,8 +69,8 @@ class Curves:
         strands, most, _ = points.shape
         _check_counts(counts, strands, least=1, most=most)
         counts = counts.astype(np.int64)
-        beyond = np.arange(most) >= counts[:, None]
-        if np.any(beyond):
+        if np.any(counts < most):
+            beyond = np.arange(most) >= counts[:, None]
             last = points[np.arange(strands), counts - 1]
             points = np.where(beyond[:, :, None], last[:, None, :], points)
         if not np.all(finite := np.isfinite(points)):
@@ -214,7 +214,7 @@ def write_arrays(
 
     Entries may be numbers, booleans or strings. The file appears when it is complete; see
     `jaxhair.output.new_file` for what is raised where it exists or its folder does not. Raises
-    ValueError where the ending is not .npz, a name is not a text or an entry is of another type.
+    ValueError where the ending is not .npz, a name is not a string or an entry is of another type.
     """
     path = Path(path)
     if path.suffix.lower() != ".npz":
@@ -255,7 +255,7 @@ def _check_counts(counts: NDArray[Any], strands: int, *, least: int, most: int) 
 
 def _check_unit(unit: float, up: str) -> None:
     # the bounds catch mistakes, and keep a product of float32 and unit far from float64's limits
-    if isinstance(unit, bool) or not isinstance(unit, int | float | np.number):
+    if isinstance(unit, bool) or not isinstance(unit, int | float | np.integer | np.floating):
         raise ValueError(f"unit is {unit!r}; it must be a number, the file's unit in metres")
     if not 1e-12 <= unit <= 1e12:
         raise ValueError(f"unit is {unit!r}; it must be from 1e-12 to 1e12 metres")
@@ -283,11 +283,14 @@ def _padded(points: Points, counts: Counts) -> Points:
             f"{_PADDED_RATIO} times the mean"
         )
     first = np.cumsum(counts) - counts
-    return points[first[:, None] + np.minimum(np.arange(most), counts[:, None] - 1)]
+    padded: Points = points[first[:, None] + np.minimum(np.arange(most), counts[:, None] - 1)]
+    return padded
 
 
 def _within(points: Points, counts: Counts) -> Points:
     """Points of all strands one after the other, shape (all points, 3): without the padding."""
+    if len(counts) == 0:  # where the size of the other axis means nothing, and may be huge
+        return np.zeros((0, 3), points.dtype)
     inside: Points = points[np.arange(points.shape[1]) < counts[:, None]]
     return inside
 
@@ -321,7 +324,7 @@ def _read_hair(data: bytes) -> tuple[Points, Counts]:
     else:
         needed = strands * (default_segments + 1)
     if needed != total:
-        raise ValueError(f"its strands' segments need {needed} points; the header has {total}")
+        raise ValueError(f"the header has {total} points; for its segments it must be {needed}")
     if not arrays & 1:
         # only now: strands is at most total, which fits the file
         counts = np.full(strands, default_segments + 1, dtype=np.int64)
@@ -387,17 +390,14 @@ def _read_npz(data: bytes) -> tuple[Points, Counts]:
     if "positions" not in arrays:
         raise ValueError("the file has no array 'positions'; strands must be in one of that name")
     points = _numbers("positions", arrays["positions"], "fiu")
-    if (
-        points.ndim not in (3, 4)
-        or points.shape[-1] != 3
-        or (points.ndim == 4 and len(points) == 0)
-    ):
+    shape = points.shape
+    # strands without points take no bytes, so their number would not be bounded by the file
+    if len(shape) not in (3, 4) or shape[-1] != 3 or shape[-2] == 0 < shape[-3] or 0 in shape[:-3]:
         raise ValueError(
-            f"positions has shape {points.shape}; it must have shape (strands, points, 3), or "
-            "(frames, strands, points, 3) with at least one frame"
+            f"positions has shape {shape}; it must have shape (strands, points, 3) or "
+            "(frames, strands, points, 3), with at least one point and frame"
         )
-    if points.ndim == 4:
-        points = points[-1]
+    points = points[-1] if len(shape) == 4 else points
     strands, most, _ = points.shape
     counts = _numbers("counts", arrays.get("counts", np.full(strands, most)), "iu")
     _check_counts(counts, strands, least=0, most=most)
@@ -418,7 +418,7 @@ def _unzip(data: bytes, names: Iterable[str] | None = None) -> dict[str, NDArray
         archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception as error:
         raise ValueError(
-            f"the file is not readable ({error}); it must be a complete .npz file"
+            f"the file is not readable ({_reason(error)}); it must be a complete .npz file"
         ) from error
     with archive:
         entries = {entry.filename: entry for entry in archive.infolist()}
@@ -432,10 +432,15 @@ def _unzip(data: bytes, names: Iterable[str] | None = None) -> dict[str, NDArray
                 arrays[name] = _unzip_array(archive, entries[filename])
             except Exception as error:
                 raise ValueError(
-                    f"array {name!r} is not readable ({error}); it must be a complete array of "
-                    "numbers, booleans or strings"
+                    f"array {name!r} is not readable ({_reason(error)}); it must be a complete "
+                    "array of numbers, booleans or strings"
                 ) from error
     return arrays
+
+
+def _reason(error: Exception) -> str:
+    # some have no text; NumPy's goes on with advice on parameters that are not offered here
+    return str(error).partition("\n")[0] or type(error).__name__
 
 
 def _unzip_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
@@ -451,6 +456,8 @@ def _unzip_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[An
             shape, _, dtype = np.lib.format.read_array_header_2_0(file)
         else:
             raise ValueError(f"version {version} of the .npy format; it must be (1, 0) or (2, 0)")
+        if dtype.hasobject:
+            raise ValueError(f"type {dtype}, which would run code")
         size = file.tell() + dtype.itemsize * math.prod(shape)
     # before NumPy allocates what the header asks for
     if size != entry.file_size or min(shape, default=0) < 0:

@@ -198,8 +198,7 @@ class Cylinder(Obstacle):
         along = quat.dot(offset, axis)
         away = offset - along * axis
         distance = quat.safe_norm(away)
-        aside = column(_perpendicular(self.axis, offset), offset)
-        normal = jnp.where(distance == 0, aside, quat.unit(away))
+        normal = jnp.where(distance == 0, quat.perpendicular(axis), quat.unit(away))
         depth = distance - self.radius
         if self.length is not None:
             depth = jnp.where(jnp.abs(along) <= self.length / 2, depth, 1)
@@ -216,13 +215,6 @@ class Cylinder(Obstacle):
         ring = float(self.radius) * (np.cos(turn) * first + np.sin(turn) * second)
         ends = [_place(self, time) + ring + side * length / 2 * axis for side in (-1, 1)]
         return np.concatenate(ends), _grid_triangles(2, segments)
-
-
-def _perpendicular(axis: Any, like: Array) -> Array:
-    """A unit vector perpendicular to the axis, shape (3,)."""
-    a = column(axis, like)[0]
-    helper = (jnp.arange(3)[:, None] == jnp.argmin(jnp.abs(a))).astype(like.dtype)
-    return quat.unit(quat.cross(a, helper))[:, 0]
 
 
 def _place(obstacle: Obstacle, time: float) -> np.ndarray:

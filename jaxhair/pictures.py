@@ -240,7 +240,8 @@ class _Artist:
             tangents=(rates / np.maximum(norm, 1e-30)).astype(np.float32),
             colors=colors.astype(np.float32),
             drawn=drawn,
-            width=self.width,
+            thickness=2,
+            width=2*self.width,
         )
         image = shading.srgb(shading.render(self.stage, hairs, shading.Surfaces(meshes)))
         if self.notes is not None:
@@ -288,17 +289,64 @@ def _box(frames: Array, meshes: Sequence[Sequence[Mesh]], axes: Array) -> tuple[
     least, most = low - grown, high + grown
     for frame in meshes:
         for vertices, _ in frame:
-            places = np.clip(vertices @ axes.T, least, most)
-            low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
+            places = vertices @ axes.T
+            near = places[np.all((places >= least) & (places <= most), -1)]
+            low, high = np.min([low, *near], 0), np.max([high, *near], 0)
     return low, high
 
 
 def _notes(stage: shading.Stage, *, bar: bool, bonded: bool) -> tuple[Array, Array]:
     """Ink (bytes) and its opacity: a scale bar, and what the colours blue to red mean."""
-    figure_module = importlib.import_module("matplotlib.figure")
-    agg = importlib.import_module("matplotlib.backends.backend_agg")
     camera = stage.camera
     width, height = camera.size
-    figure = figure_module.Figure((width / 100, height / 100), dpi=100, facecolor="none")
-    canvas = agg.FigureCanvasAgg(figure)
-    return None
+    figure, canvas = _figure(width / 100, height / 100)
+    unit = min(width, height) / 800
+    style: dict[str, Any] = {"color": "0.15", "fontsize": 11 * unit, "ha": "center"}
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height))
+    axes.axis("off")
+    if bar:
+        scale = camera.focal / float((stage.centre - camera.position) @ camera.axes[2])
+        length = _round_length(0.18 * width / scale)
+        start, end, y = 28 * unit, 28 * unit + length * scale, 28 * unit
+        axes.plot([start, end], [y, y], color="0.15", linewidth=2 * unit, solid_capstyle="butt")
+        text = f"{1e2 * length:g} cm" if length >= 0.01 else f"{1e3 * length:g} mm"
+        axes.text((start + end) / 2, y + 8 * unit, text, va="bottom", **style)
+    if bonded:
+        left, right, y = width - 188 * unit, width - 28 * unit, 28 * unit
+        ramp = shading.srgb(shading.bonded_color(np.linspace(0, 1, 64)))[None]
+        axes.imshow(ramp, extent=(left, right, y - 4 * unit, y + 4 * unit), aspect="auto")
+        axes.set(xlim=(0, width), ylim=(0, height))
+        axes.text((left + right) / 2, y + 8 * unit, "bonded fraction", va="bottom", **style)
+        for x, text in ((left, "0"), (right, "1")):
+            axes.text(x, y - 6 * unit, text, va="top", **style)
+    canvas.draw()
+    ink = np.asarray(canvas.buffer_rgba(), float)
+    return ink[..., :3], ink[..., 3:] / 255
+
+
+def _round_length(most: float) -> float:
+    """The largest of 1, 2, 5, 10, ... times a power of ten that is at most `most`."""
+    power = 10 ** math.floor(math.log10(most))
+    return power * max(step for step in (1, 2, 5) if step * power <= most)
+
+
+def _figure(width: float, height: float) -> tuple[Any, Any]:
+    """A matplotlib figure [inch] and its canvas, apart from pyplot and its global state."""
+    figure = _optional("matplotlib.figure").Figure((width, height), dpi=100, facecolor="none")
+    return figure, _optional("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)
+
+
+def _optional(module: str) -> Any:
+    """A module that only pictures need."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(
+            f'pictures need {module.partition(".")[0]}: pip install "jaxhair[pictures]"'
+        ) from error
+
+
+def draw(points, *, counts=None, bonded=None, meshes=(), hairs_per_strand=10, view=View(), size=(800,800), color=HAIR_COLOR, seed=0, scale_bar=True):
+    points=np.asarray(points)
+    a=_Artist(points[None],[meshes],counts=counts,hairs_per_strand=hairs_per_strand,view=view,size=size,color=color,seed=seed,bar=scale_bar,bonded=bonded is not None)
+    return a.draw(points,bonded,meshes)

@@ -113,11 +113,16 @@ def between(a: Array, b: Array) -> Array:
     """
     w = 1 + dot(a, b)
     opposite = w < 1e-6
-    least = jnp.argmin(jnp.abs(a), axis=-2, keepdims=True)
-    helper = (jnp.arange(3)[:, None] == least).astype(a.dtype)
     q = jnp.concatenate([w, cross(a, b)], axis=-2)
-    half_turn = jnp.concatenate([jnp.zeros_like(w), cross(a, helper)], axis=-2)
+    half_turn = jnp.concatenate([jnp.zeros_like(w), perpendicular(a)], axis=-2)
     return unit(jnp.where(opposite, half_turn, q))
+
+
+def perpendicular(a: Array) -> Array:
+    """Some unit vector perpendicular to a."""
+    smallest = jnp.argmin(jnp.abs(a), axis=-2)
+    helper = jnp.moveaxis(jax.nn.one_hot(smallest, 3, dtype=a.dtype), -1, -2)
+    return unit(cross(a, helper))
 
 
 def vector_multiply(v: Array, q: Array) -> Array:

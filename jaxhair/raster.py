@@ -119,8 +119,10 @@ def triangles(camera: Camera, corners: Array, near: float) -> Array:
     return buffer
 
 
-def lines(camera: Camera, start: Array, end: Array, buffer: Array, bias: float) -> None:
-    """Draw lines, one sample a pixel, into `buffer` in place.
+def lines(
+    camera: Camera, start: Array, end: Array, buffer: Array, *, bias: float, thickness: int
+) -> None:
+    """Draw lines, `thickness` pixels across, into `buffer` in place.
 
     start, end: homogeneous places of the ends, shape (n, 3). What is seen is named by 64 i + k
     for line i at the fraction k / 63 of its length.
@@ -144,10 +146,12 @@ def lines(camera: Camera, start: Array, end: Array, buffer: Array, bias: float) 
         along = (np.arange(len(row)) - first[row] + 0.5).astype(np.float32) / n[row]
         xy = a[few][row] + along[:, None] * (b[few] - a[few])[row]
         depth = start[lines, 2][row] + along * (end[lines, 2] - start[lines, 2])[row] - bias
-        ok = np.all((xy >= 0) & (xy < limit), -1)
-        cell = xy.astype(np.int64)
-        place = cell[:, 1] * width + cell[:, 0]
-        name = lines[row] * 64 + (along * 63).astype(np.int64)
-        np.minimum.at(buffer, place[ok], _key(depth[ok], name[ok]))
+        key = _key(depth, lines[row] * 64 + (along * 63).astype(np.int64))
+        steep = (np.abs(b - a)[few] @ [-1, 1] > 0)[row]
+        for shift in np.arange(thickness) - (thickness - 1) / 2:
+            x = np.floor(xy[:, 0] + np.float32(shift) * steep).astype(np.int64)
+            y = np.floor(xy[:, 1] + np.float32(shift) * ~steep).astype(np.int64)
+            ok = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            np.minimum.at(buffer, (y * width + x)[ok], key[ok])
 
 

@@ -138,7 +138,9 @@ class Shadows:
             depth = places[:, 2] * np.float64(0.996 if on_hair else 1.0)
             seen = _sample(self.hidden, self.CELL * y + 1.5, self.CELL * x + 1.5)
             result *= np.minimum(seen * np.exp(-self._relative(depth)), 1)
-        return np.asarray(result, np.float32)
+        rows, columns = self.total.shape
+        inside = (places[:, 2] > 0) & (x > 0) & (y > 0) & (x < columns - 1) & (y < rows - 1)
+        return np.where(inside, result, 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -149,13 +151,15 @@ class Hairs:
     tangents: unit vectors along the hairs, the same shape.
     colors: linear RGB, the same shape.
     drawn: which of the edges between vertices to draw, shape (hairs, vertices - 1).
-    width: [m] that the eye takes one drawn hair for.
+    thickness: of a line, in pixels / SUPERSAMPLING.
+    width: [m] of a line in the middle of the scene.
     """
 
     points: Array
     tangents: Array
     colors: Array
     drawn: Array
+    thickness: int
     width: float
 
 
@@ -241,7 +245,7 @@ def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
 
     places = fine.project(hairs.points)
     starts, ends = places[:, :-1][hairs.drawn], places[:, 1:][hairs.drawn]
-    raster.lines(fine, starts, ends, buffer, 0.01 * radius)
+    raster.lines(fine, starts, ends, buffer, bias=0.01 * radius, thickness=hairs.thickness)
     colors = _lit_hairs(camera, light, hairs, shadows)
     names = (buffer & np.uint64(raster.NOTHING)).astype(np.int64)
     seen = np.flatnonzero(names != raster.NOTHING)

@@ -42,7 +42,7 @@ class PositionBased:
 
     iterations: int = static(default=5)
     sweep: str = static(default="red-black")
-    orientation_weight: Any = 1.0
+    orientation_weight: Any = 0.1
 
     def __post_init__(self) -> None:
         check.whole("solver.iterations", self.iterations, least=1)
@@ -62,9 +62,8 @@ class PositionBased:
         w, free, length = rod.point_weights, rod.edge_weights, rod.lengths
         k = stiffness_per_iteration(rod.stiffness, self.iterations)
         if rod.ragged:
-            exists = rod.edge_exists()
-            length = jnp.where(exists, length, 1)
-            w = w * rod.point_exists()
+            length = jnp.where(rod.edge_exists(), length, 1)
+            exists = rod.edge_exists().astype(length.dtype)
             k = k * exists[1:]
         wq = free * self.orientation_weight / length**2
         stretch = rods.stretch_shear_factors(w[:-1], w[1:], wq, length)

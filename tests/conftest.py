@@ -1,0 +1,7 @@
+"""Every test runs with strict dtypes and ranks; float64 is on so that both precisions can be tested."""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
