@@ -1,199 +1,180 @@
 """Pictures and movies of hair: positions in metres in, .png, .gif and .mp4 out.
 
 Simulated strands are few and angular. As in the paper (section 7.1), more hairs are interpolated
-between them and the points of each are joined by Bezier curves; shading.py lights the result.
+between them and the points of each are joined by Bezier curves (interpolation.py), and the result
+is lit after Kajiya and Kay (shading.py). Needs the extra `pictures`.
 """
 
-import contextlib
-import importlib
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
 from jaxhair import check, raster, shading
+from jaxhair.figures import PathLike, check_suffix, comparison, figure, optional
+from jaxhair.interpolation import Interpolation, bezier, used_points
 from jaxhair.output import new_file
-from jaxhair.raster import Array, Camera
+from jaxhair.raster import Array, Camera, View
 from jaxhair.shading import Mesh
 
-HAIR_COLOR = (0.36, 0.21, 0.12)
+__all__ = ["View", "comparison", "draw", "movie", "picture"]
+
+Color = tuple[float, float, float]
+Progress = Callable[[range], Iterable[int]]
+
+HAIR_COLOR: Color = (0.42, 0.25, 0.14)
 FIELD_OF_VIEW = math.radians(28)
 
 
-@dataclass(frozen=True)
-class View:
-    """Where the picture is taken from; what is left out is chosen so that all hair is seen.
+class Options(TypedDict, total=False):
+    """How hair is drawn, wherever it is drawn.
 
-    azimuth: [rad] of the camera about the Z axis, from +X towards +Y.
-    elevation: [rad] of the camera above the horizontal.
-    target: point [m] in the middle of the picture, shape (3,).
-    distance: [m] from the camera to the target.
+    hairs_per_strand: hairs drawn for each strand, by default 10.
+    view: where from; by default `View()`.
+    size: width and height in pixels, by default (800, 800).
+    color: RGB of the hair in [0, 1], as on a screen; by default brown.
+    seed: of the random numbers that place the interpolated hairs, by default 0.
+    scale_bar: whether to draw one, by default True; it is right at the middle of the scene.
     """
 
-    azimuth: float = -1.2
-    elevation: float = 0.25
-    target: tuple[float, float, float] | None = None
-    distance: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("azimuth", "elevation"):
-            check.shape(f"view.{name}", getattr(self, name), ())
-            check.finite(f"view.{name}", getattr(self, name))
-        if abs(self.elevation) > math.pi / 2:
-            raise ValueError(
-                f"view.elevation is {self.elevation!r}; it must be in [-pi/2, pi/2] (radians)"
-            )
-        if self.target is not None:
-            check.vector("view.target", self.target)
-        if self.distance is not None:
-            check.shape("view.distance", self.distance, ())
-            check.positive("view.distance", self.distance)
+    hairs_per_strand: int
+    view: View
+    size: tuple[int, int]
+    color: Color
+    seed: int
+    scale_bar: bool
 
 
-@dataclass(frozen=True)
-class Interpolation:
-    """Where further hairs grow about simulated strands: drawn once, then used for every frame.
+def draw(
+    points: Array,
+    *,
+    counts: Array | None = None,
+    bonded: Array | None = None,
+    meshes: Sequence[Mesh] = (),
+    **options: Unpack[Options],
+) -> Array:
+    """The picture as bytes, shape (height, width, 3).
 
-    guide: strand that a hair follows, shape (hairs,); the first hair of each strand is itself.
-    neighbours, weights: the strands that it leans towards and how much, shape (hairs, 2).
-    offset: [m] by which it stands off in any case, shape (hairs, 3).
-    clumping: how much of all that is gone at the tip, shape (hairs,).
-    trimmed: part of the length cut off at the tip, shape (hairs,).
-    shade: factor of the colour, shape (hairs,).
-    reach: [m] beyond which a strand pulls no harder.
+    points: [m], Z up, shape (strands, points, 3).
+    counts: points of each strand, shape (strands,); without it they end where the padding, which
+        repeats the last point, begins.
+    bonded: bonded fraction in [0, 1], shape (strands, points), shown from blue (0) to red (1) in
+        place of the hair colour.
+    meshes: obstacles, pairs of vertices [m], shape (n, 3), and triangles, shape (m, 3).
+    options: see `Options`.
     """
-
-    guide: Array
-    neighbours: Array
-    weights: Array
-    offset: Array
-    clumping: Array
-    trimmed: Array
-    shade: Array
-    reach: float
-
-    @classmethod
-    def between(cls, points: Array, hairs_per_strand: int, seed: int) -> "Interpolation":
-        """points: one frame [m], shape (strands, points, 3)."""
-        strands = len(points)
-        length = np.median(np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(1))
-        index, distance = _nearest(points[:, 0], 6)
-        spacing = float(np.median(distance[:, 0])) if strands > 1 else np.inf
-        reach = min(3 * spacing, 0.1 * length)
-        random = np.random.default_rng(seed)
-        guide = np.repeat(np.arange(strands), hairs_per_strand)
-        hairs = len(guide)
-        extra = (np.arange(hairs) % hairs_per_strand != 0).astype(float)
-        # The nearest strand counts most, so that hairs of one strand stay in its own surroundings.
-        shares = np.sort(random.dirichlet([1, 1, 1], hairs), -1)[:, :2] * extra[:, None]
-        chosen = np.argsort(random.random((hairs, index.shape[1])), -1)[:, :2]
-        neighbours = np.take_along_axis(index[guide], chosen, -1)
-        near = np.take_along_axis(distance[guide], chosen, -1) <= reach
-        wisp = 0.006 * length * np.where(near.any(-1), 0.5, 1.0)
-        direction = random.standard_normal((hairs, 3))
-        return cls(
-            guide=guide,
-            neighbours=neighbours,
-            weights=shares * near,
-            offset=direction * (np.minimum(wisp, 0.3 * spacing) * extra)[:, None],
-            clumping=random.uniform(0.1, 0.6, hairs),
-            trimmed=np.abs(random.normal(0, 0.03, hairs)) * extra,
-            shade=np.exp(random.normal(0, 0.18, hairs)),
-            reach=float(reach),
-        )
-
-    def hairs(self, points: Array, counts: Array) -> Array:
-        """All hairs [m], shape (hairs, points, 3)."""
-        own = points[self.guide]
-        place = np.arange(points.shape[1])
-        along = np.minimum(place / np.maximum(counts[self.guide, None] - 1, 1), 1)
-        lean = np.zeros_like(own)
-        for k in range(self.neighbours.shape[1]):
-            other = self.neighbours[:, k]
-            # Past the tip of the shorter one, the hairs run on side by side.
-            both = np.minimum(counts[self.guide], counts[other])[:, None] - 1
-            upto = np.minimum(place, both)[..., None]
-            apart = np.take_along_axis(points[other] - own, upto, 1)
-            far = np.linalg.norm(apart, axis=-1, keepdims=True) / self.reach
-            lean += self.weights[:, k, None, None] * apart / (1 + far**2) ** 0.5
-        lean += self.offset[:, None] * np.minimum(0.35 + 2 * along, 1)[..., None]
-        return own + lean * (1 - self.clumping[:, None] * along**1.5)[..., None]
+    fractions = None if bonded is None else np.asarray(bonded)[None]
+    frames = np.asarray(points)[None]
+    return _Scene("points", frames, counts, fractions, [meshes], **options).image(0)
 
 
-def _nearest(places: Array, most: int) -> tuple[Array, Array]:
-    """Indices and distances of the other places next to each, nearest first."""
-    count = min(most, len(places) - 1)
-    index = np.zeros((len(places), max(count, 1)), int)
-    distance = np.full(index.shape, np.inf)
-    for start in range(0, len(places) if count else 0, 512):
-        rows = np.arange(start, min(start + 512, len(places)))
-        square = np.sum((places[rows, None] - places) ** 2, -1)
-        square[np.arange(len(rows)), rows] = np.inf
-        index[rows] = np.argsort(square, -1, kind="stable")[:, :count]
-        distance[rows] = np.sqrt(np.take_along_axis(square, index[rows], -1))
-    return index, distance
+def picture(path: PathLike, points: Array, *, overwrite: bool = False, **options: Any) -> None:
+    """Write a .png file of what `draw(points, **options)` returns."""
+    check_suffix(path, ".png")
+    with new_file(path, overwrite=overwrite) as temporary:
+        optional("PIL.Image").fromarray(draw(points, **options)).save(temporary)
 
 
-def bezier(points: Array, counts: Array, pieces: int) -> tuple[Array, Array]:
-    """Smooth curves through `points` and their derivatives.
+def movie(
+    path: PathLike,
+    frames: Array,
+    *,
+    fps: float,
+    counts: Array | None = None,
+    bonded: Array | None = None,
+    meshes: Sequence[Sequence[Mesh]] | None = None,
+    overwrite: bool = False,
+    progress: Progress = iter,
+    **options: Unpack[Options],
+) -> None:
+    """Write a movie as a .gif or an .mp4 file; the camera stands still.
 
-    Between two points lies a cubic Bezier curve whose inner control points continue the chords
-    (Catmull and Rom). points: shape (hairs, points, 3); counts: points in use, shape (hairs,);
-    both results have the shape (hairs, (points - 1) pieces + 1, 3).
+    frames: positions [m], shape (frames, strands, points, 3).
+    fps: frames a second, at most 50 for a .gif.
+    bonded: bonded fraction, shape (frames, strands, points).
+    meshes: obstacles of each frame.
+    progress: called with the range of frames to draw; returns them one by one, as tqdm does.
+    counts: points of each strand, as for `draw`.
+    options: see `Options`.
+    A .gif shows a frame that equals the one before
+    by waiting longer, so it can hold fewer frames.
     """
-    last = (np.maximum(counts, 2) - 1)[:, None]
-    place = np.arange(points.shape[1])
+    suffix = check_suffix(path, ".gif", ".mp4")
+    check.shape("fps", fps, ())
+    check.positive("fps", fps)
+    if suffix == ".gif" and fps > 50:
+        raise ValueError(f"fps is {fps!r}; it must be at most 50 for a .gif")
+    scene = _Scene("frames", np.asarray(frames), counts, bonded, meshes, **options)
+    width, height = scene.stage.camera.size
+    if suffix == ".mp4" and (width % 2 or height % 2):
+        raise ValueError(f"size is {(width, height)}; both must be even for an .mp4")
+    with new_file(path, overwrite=overwrite) as temporary:
+        if suffix == ".gif":
+            _write_gif(temporary, scene, fps, progress)
+        else:
+            _write_mp4(temporary, scene, fps, progress)
 
-    def at(index: Array) -> Array:
-        return np.take_along_axis(points, np.clip(index, 0, last)[..., None], 1)
 
-    # Mirrored end points would end straight; a parabola through the last three keeps the curl.
-    here, before, after = at(place + 0 * last), at(place - 1 + 0 * last), at(place + 1 + 0 * last)
-    slope = (after - before) / 2
-    curved = (last > 1)[..., None]
-    first = np.where(curved, 2 * (after - here) - (at(place + 2 + 0 * last) - here) / 2, after - here)
-    final = np.where(
-        curved, 2 * (here - before) - (here - at(place - 2 + 0 * last)) / 2, here - before
+def _write_mp4(path: Path, scene: "_Scene", fps: float, progress: Progress) -> None:
+    writer = optional("imageio_ffmpeg").write_frames(
+        str(path), scene.stage.camera.size, fps=fps, quality=8, macro_block_size=2
     )
-    slope = np.where((place == 0)[:, None], first, slope)
-    slope = np.where((place == last)[..., None], final, slope)
-    start, end = here[:, :-1], here[:, 1:]
-    control = np.stack([start, start + slope[:, :-1] / 3, end - slope[:, 1:] / 3, end], 2)
-    t = np.arange(pieces) / pieces
-    value = _bernstein(3, t) @ control
-    rate = 3 * _bernstein(2, t) @ np.diff(control, axis=2)
-    shape = (len(points), -1, 3)
-    curve = np.concatenate([value.reshape(shape), end[:, -1:]], 1)
-    return curve, np.concatenate([rate.reshape(shape), slope[:, -1:]], 1)
+    try:
+        writer.send(None)
+        for index in progress(range(scene.count)):
+            writer.send(np.ascontiguousarray(scene.image(index)))
+    finally:
+        writer.close()
 
 
-def _bernstein(degree: int, t: Array) -> Array:
-    """Bernstein polynomials at t, shape (n, degree + 1)."""
-    return np.stack(
-        [math.comb(degree, k) * t**k * (1 - t) ** (degree - k) for k in range(degree + 1)], -1
-    )
+def _write_gif(path: Path, scene: "_Scene", fps: float, progress: Progress) -> None:
+    image = optional("PIL.Image")
+    count = scene.count
+    # One palette for all frames, or the background would flicker.
+    few = [scene.image(index) for index in sorted({0, count // 2, count - 1})]
+    palette = image.fromarray(np.concatenate(few)).quantize(256)
+
+    def coded() -> Iterator[Any]:
+        for index in progress(range(count)):
+            frame = image.fromarray(scene.image(index))
+            yield frame.quantize(palette=palette, dither=image.Dither.NONE)
+
+    # A .gif counts in hundredths of a second; rounding the ends keeps the total right.
+    ends = [round(100 * index / fps) for index in range(count + 1)]
+    durations = [10 * (end - start) for start, end in itertools.pairwise(ends)]
+    frames = coded()
+    next(frames).save(path, save_all=True, append_images=frames, duration=durations, loop=0)
 
 
-class _Artist:
-    """What stays the same from one frame of a movie to the next."""
+class _Scene:
+    """What is the same in all frames of a movie, and the images, drawn when asked for."""
 
     def __init__(
         self,
+        name: str,
         frames: Array,
-        meshes: Sequence[Sequence[Mesh]],
-        *,
         counts: Array | None,
-        hairs_per_strand: int,
-        view: View,
-        size: tuple[int, int],
-        color: tuple[float, float, float],
-        seed: int,
-        bar: bool,
-        bonded: bool,
+        bonded: Array | None,
+        meshes: Sequence[Sequence[Mesh]] | None,
+        *,
+        hairs_per_strand: int = 10,
+        view: View | None = None,
+        size: tuple[int, int] = (800, 800),
+        color: Color = HAIR_COLOR,
+        seed: int = 0,
+        scale_bar: bool = True,
     ) -> None:
+        # One picture is a movie of one frame; messages speak of what the caller gave.
+        one = name == "points"
+        given = frames[0] if one else frames
+        shape: tuple[int | str, ...] = ("strands", "points", 3)
+        check.shape(name, given, shape if one else ("frames", *shape))
+        check.finite(name, given)
+        if frames.shape[2] < 2:
+            raise ValueError(f"{name} has 1 point a strand; it must have 2 or more")
         check.whole("hairs_per_strand", hairs_per_strand, least=1)
         check.whole("seed", seed, least=0)
         check.shape("size", size, (2,))
@@ -201,69 +182,97 @@ class _Artist:
             check.whole("size", side, least=16)
         check.shape("color", color, (3,))
         check.fraction("color", color)
-        if counts is None:
-            counts = np.full(frames.shape[1], frames.shape[2])
-        check.shape("counts", counts, (frames.shape[1],))
-        for count in np.ravel(counts):
-            check.whole("counts", count, least=2)
-            if count > frames.shape[2]:
-                raise ValueError(f"counts has the value {count}; it must be at most {frames.shape[2]}")
-        self.counts = np.asarray(counts)
+        if bonded is not None:
+            bonded = np.asarray(bonded)
+            given = bonded[0] if one else bonded
+            check.shape("bonded", given, frames.shape[one:-1])
+            check.fraction("bonded", given)
+        self.count = len(frames)
+        self.frames = frames
+        self.bonded = bonded
+        self.meshes = _checked_meshes(meshes, len(frames))
+        self.used = used_points(counts, frames[0])
         self.color = shading.linear(np.asarray(color))
-        self.stage = _stage(frames, meshes, view, size)
+        self.stage = _stage(frames, self.meshes, view or View(), (int(size[0]), int(size[1])))
         self.interpolation = Interpolation.between(frames[0], hairs_per_strand, seed)
-        self.notes = _notes(self.stage, bar=bar, bonded=bonded) if bar or bonded else None
+        self.notes = _notes(self.stage, bar=scale_bar, bonded=bonded is not None)
 
-    def draw(self, points: Array, bonded: Array | None, meshes: Sequence[Mesh]) -> Array:
-        camera = self.stage.camera
-        grown = self.interpolation
-        counts = self.counts[grown.guide]
-        coarse = grown.hairs(points, counts=self.counts)
+    def image(self, index: int) -> Array:
+        """Bytes, shape (height, width, 3)."""
+        surfaces = shading.Surfaces(self.meshes[index])
+        image = shading.srgb(shading.render(self.stage, self._hairs(index), surfaces))
+        ink, opacity = self.notes
+        noted: Array = np.round(image * (1 - opacity) + ink * opacity).astype(np.uint8)
+        return noted
+
+    def _hairs(self, index: int) -> shading.Hairs:
+        camera, added = self.stage.camera, self.interpolation
+        points = self.frames[index].astype(np.float32)
+        used = self.used[added.guide]
+        # Curves are cut into pieces of about five pixels, so that no corner shows.
         depth = max(float(np.min(camera.project(points)[..., 2])), 0.1 * self.stage.radius)
         longest = np.max(np.linalg.norm(np.diff(points, axis=1), axis=-1)) / depth * camera.focal
         pieces = int(np.clip(np.ceil(longest / 5), 1, 16))
-        curves, rates = bezier(coarse, counts, pieces)
+        curves, rates = bezier(added.hairs(points, self.used), used, pieces)
         steps = np.arange(curves.shape[1])
-        ends = (counts - 1) * pieces * (1 - grown.trimmed)
-        drawn = steps[:-1] < np.ceil(ends)[:, None]
-        if bonded is None:
-            colors = np.broadcast_to(self.color, curves.shape)
-        else:
-            index, part = np.divmod(steps, pieces)
-            after = np.minimum(index + 1, points.shape[1] - 1)
-            rise = (bonded[:, after] - bonded[:, index]) * (part / pieces)
-            colors = shading.bonded_color((bonded[:, index] + rise)[grown.guide])
-        colors = colors * grown.shade[:, None, None]
-        norm = np.linalg.norm(rates, axis=-1, keepdims=True)
-        hairs = shading.Hairs(
+        ends = np.ceil((used - 1) * pieces * (1 - added.cut))
+        colors = np.broadcast_to(self.color, curves.shape)
+        if self.bonded is not None:
+            place = np.arange(points.shape[1]) * pieces
+            rows = [np.interp(steps, place, row) for row in self.bonded[index]]
+            colors = shading.bonded_color(np.array(rows))[added.guide]
+        thickness = max(1, round(shading.SUPERSAMPLING * min(camera.size) / 800))
+        pixel = np.linalg.norm(camera.position - self.stage.centre) / camera.focal
+        return shading.Hairs(
             points=curves.astype(np.float32),
-            tangents=(rates / np.maximum(norm, 1e-30)).astype(np.float32),
-            colors=colors.astype(np.float32),
-            drawn=drawn,
-            thickness=2,
-            width=2*self.width,
+            tangents=shading.unit(rates).astype(np.float32),
+            colors=(colors * added.shade[:, None, None]).astype(np.float32),
+            drawn=steps[:-1] < ends[:, None],
+            # A highlight washes out the colours that show the bonds.
+            gloss=0.30 if self.bonded is None else 0.08,
+            thickness=thickness,
+            width=float(pixel) * thickness / shading.SUPERSAMPLING,
         )
-        image = shading.srgb(shading.render(self.stage, hairs, shading.Surfaces(meshes)))
-        if self.notes is not None:
-            ink, alpha = self.notes
-            image = np.round(image * (1 - alpha) + ink * alpha).astype(np.uint8)
-        return image
 
-    @property
-    def width(self) -> float:
-        """[m] across one line, at the centre of the scene."""
-        camera = self.stage.camera
-        distance = float(np.linalg.norm(camera.position - self.stage.centre))
-        return distance / camera.focal / shading.SUPERSAMPLING
+
+def _checked_meshes(
+    meshes: Sequence[Sequence[Mesh]] | None, frames: int
+) -> Sequence[Sequence[Mesh]]:
+    if meshes is None:
+        return [()] * frames
+    if len(meshes) != frames:
+        raise ValueError(f"meshes has {len(meshes)} entries; it must have {frames}, one a frame")
+    checked: dict[int, Mesh] = {}  # a mesh that stands still is often one object in all frames
+    for frame in meshes:
+        for mesh in frame:
+            if id(mesh) not in checked:
+                checked[id(mesh)] = _checked_mesh(mesh)
+    return [[checked[id(mesh)] for mesh in frame] for frame in meshes]
+
+
+def _checked_mesh(mesh: Mesh) -> Mesh:
+    if len(mesh) != 2:
+        raise ValueError(f"a mesh has {len(mesh)} parts; it must have 2, vertices and triangles")
+    vertices, triangles = (np.asarray(part) for part in mesh)
+    check.shape("vertices of a mesh", vertices, ("vertices", 3))
+    check.finite("vertices of a mesh", vertices)
+    check.shape("triangles of a mesh", triangles, ("triangles", 3))
+    wrong = (triangles < 0) | (triangles >= len(vertices)) | (triangles % 1 != 0)
+    if np.any(wrong):
+        raise ValueError(
+            f"triangles of a mesh have the value {triangles[wrong][0]}; "
+            f"it must be a whole number in [0, {len(vertices) - 1}]"
+        )
+    return vertices.astype(float), triangles.astype(int)
 
 
 def _stage(
     frames: Array, meshes: Sequence[Sequence[Mesh]], view: View, size: tuple[int, int]
 ) -> shading.Stage:
+    """The camera for `view` and a light, such that all hair of all frames is seen and lit."""
     towards = raster.axes_towards(view.azimuth, view.elevation)
-    boxes = [_box(frames, meshes, axes) for axes in (towards, np.eye(3))]
-    (low, high), (floor, roof) = boxes
-    radius = max(float(np.linalg.norm(roof - floor)) / 2, 1e-4)
+    low, high = _box(frames, meshes, towards)
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-4)
     centre = towards.T @ ((low + high) / 2)
     target = centre if view.target is None else np.asarray(view.target, float)
     focal = min(size) / 2 / math.tan(FIELD_OF_VIEW / 2)
@@ -299,13 +308,14 @@ def _notes(stage: shading.Stage, *, bar: bool, bonded: bool) -> tuple[Array, Arr
     """Ink (bytes) and its opacity: a scale bar, and what the colours blue to red mean."""
     camera = stage.camera
     width, height = camera.size
-    figure, canvas = _figure(width / 100, height / 100)
+    drawing, canvas = figure(width / 100, height / 100, dpi=100, facecolor="none")
     unit = min(width, height) / 800
     style: dict[str, Any] = {"color": "0.15", "fontsize": 11 * unit, "ha": "center"}
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height))
+    axes = drawing.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height))
     axes.axis("off")
-    if bar:
-        scale = camera.focal / float((stage.centre - camera.position) @ camera.axes[2])
+    depth = float((stage.centre - camera.position) @ camera.axes[2])
+    if bar and depth > 0:
+        scale = camera.focal / depth
         length = _round_length(0.18 * width / scale)
         start, end, y = 28 * unit, 28 * unit + length * scale, 28 * unit
         axes.plot([start, end], [y, y], color="0.15", linewidth=2 * unit, solid_capstyle="butt")
@@ -326,27 +336,5 @@ def _notes(stage: shading.Stage, *, bar: bool, bonded: bool) -> tuple[Array, Arr
 
 def _round_length(most: float) -> float:
     """The largest of 1, 2, 5, 10, ... times a power of ten that is at most `most`."""
-    power = 10 ** math.floor(math.log10(most))
+    power: float = 10 ** math.floor(math.log10(most))
     return power * max(step for step in (1, 2, 5) if step * power <= most)
-
-
-def _figure(width: float, height: float) -> tuple[Any, Any]:
-    """A matplotlib figure [inch] and its canvas, apart from pyplot and its global state."""
-    figure = _optional("matplotlib.figure").Figure((width, height), dpi=100, facecolor="none")
-    return figure, _optional("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)
-
-
-def _optional(module: str) -> Any:
-    """A module that only pictures need."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f'pictures need {module.partition(".")[0]}: pip install "jaxhair[pictures]"'
-        ) from error
-
-
-def draw(points, *, counts=None, bonded=None, meshes=(), hairs_per_strand=10, view=View(), size=(800,800), color=HAIR_COLOR, seed=0, scale_bar=True):
-    points=np.asarray(points)
-    a=_Artist(points[None],[meshes],counts=counts,hairs_per_strand=hairs_per_strand,view=view,size=size,color=color,seed=seed,bar=scale_bar,bonded=bonded is not None)
-    return a.draw(points,bonded,meshes)

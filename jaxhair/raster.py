@@ -1,16 +1,49 @@
-"""Cameras and a z-buffer for triangles and lines. Plain NumPy, no graphics driver.
+"""Views, cameras, and a z-buffer for triangles and lines. Plain NumPy, no graphics driver.
 
 Places on an image are in pixels: x to the right, y downwards, the centre of the first pixel at
 (0.5, 0.5). A z-buffer is an array of unsigned 64-bit integers, shape (height * width,): in the
 upper half of an entry the bits of the depth, in the lower half the name of what is seen there.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from jaxhair import check
+
 Array = np.ndarray
 NOTHING = 0xFFFFFFFF  # the name of what is seen where nothing is
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the picture is taken from; what is left out is chosen so that all hair is seen.
+
+    azimuth: [rad] of the camera about the Z axis, from +X towards +Y.
+    elevation: [rad] of the camera above the horizontal.
+    target: point [m] in the middle of the picture, shape (3,).
+    distance: [m] from the camera to the target.
+    """
+
+    azimuth: float = -1.2
+    elevation: float = 0.25
+    target: tuple[float, float, float] | None = None
+    distance: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth", "elevation"):
+            check.shape(f"view.{name}", getattr(self, name), ())
+            check.finite(f"view.{name}", getattr(self, name))
+        if abs(self.elevation) > math.pi / 2:
+            raise ValueError(
+                f"view.elevation is {self.elevation!r}; it must be in [-pi/2, pi/2] (radians)"
+            )
+        if self.target is not None:
+            check.vector("view.target", self.target)
+        if self.distance is not None:
+            check.shape("view.distance", self.distance, ())
+            check.positive("view.distance", self.distance)
 
 
 @dataclass(frozen=True)
@@ -32,7 +65,7 @@ class Camera:
         """Homogeneous places (x w, y w, w) of `points`, both of shape (..., 3); w is depth [m]."""
         offset = np.array([[self.focal, 0, 0], [0, self.focal, 0], [*self.half, 1]])
         matrix = (self.axes.T @ offset).astype(np.float32)
-        return (points - self.position).astype(np.float32) @ matrix
+        return np.asarray((points - self.position).astype(np.float32) @ matrix)
 
     @property
     def half(self) -> tuple[float, float]:
@@ -41,11 +74,10 @@ class Camera:
 
     def unproject(self, x: Array, y: Array, depth: Array) -> Array:
         """The points [m], shape (n, 3), at the places x, y and depths [m] of shape (n,)."""
-        rays = np.stack([(x - self.half[0]), (y - self.half[1])], -1) / np.float32(self.focal)
-        rays = np.concatenate([rays, np.ones((len(rays), 1), np.float32)], -1)
-        return (self.position + depth[:, None] * (rays @ self.axes.astype(np.float32))).astype(
-            np.float32
-        )
+        place = np.stack([x - self.half[0], y - self.half[1], np.full_like(x, self.focal)], -1)
+        rays = place.astype(np.float32) @ (self.axes / self.focal).astype(np.float32)
+        points: Array = rays * depth[:, None] + self.position.astype(np.float32)
+        return points
 
 
 def axes_towards(azimuth: float, elevation: float) -> Array:
@@ -153,5 +185,3 @@ def lines(
             y = np.floor(xy[:, 1] + np.float32(shift) * ~steep).astype(np.int64)
             ok = (x >= 0) & (x < width) & (y >= 0) & (y < height)
             np.minimum.at(buffer, (y * width + x)[ok], key[ok])
-
-

@@ -17,6 +17,7 @@ from jaxhair.pytree import pytree, static
 from jaxhair.solvers import PositionBased
 from jaxhair.strands import Strands
 
+
 @pytree
 class Phase:
     """A stretch of time in which the same effects act.
@@ -132,7 +133,12 @@ class Scene:
 
     def __str__(self) -> str:
         size = f"{self.strands.count} strands of {self.strands.points} points"
-        lines = [f"{size}, dt {self.dt:g} s", f"  {self.fibre}", f"  {self.bonds}", f"  {self.solver}"]
+        lines = [
+            f"{size}, dt {self.dt:g} s",
+            f"  {self.fibre}",
+            f"  {self.bonds}",
+            f"  {self.solver}",
+        ]
         for phase in self.phases:
             lines.append(f"  {phase.name}: {phase.steps(self.dt)} steps")
             lines += [f"    {effect}" for effect in phase.effects]

@@ -36,14 +36,17 @@ def kajiya_kay(tangent: Array, to_light: Array, to_eye: Array, power: float) -> 
 
 def bonded_color(bonded: Array) -> Array:
     """Blue at 0 to red at 1, shape (..., 3)."""
-    return BONDED_COLORS[0] + bonded[..., None] * (BONDED_COLORS[1] - BONDED_COLORS[0])
+    low, high = BONDED_COLORS
+    color: Array = low + bonded[..., None] * (high - low)
+    return color
 
 
 def srgb(linear: Array) -> Array:
     """Linear RGB as bytes for a screen."""
     x = np.clip(linear, 0, 1)
     curve = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.round(255 * curve).astype(np.uint8)
+    color: Array = np.round(255 * curve).astype(np.uint8)
+    return color
 
 
 def linear(color: Array) -> Array:
@@ -114,7 +117,7 @@ class Shadows:
         if len(corners):
             buffer = raster.triangles(light, corners, 0.05 * self.front)
             first = np.exp(self._relative(raster.depth_of(buffer).astype(np.float64)))
-            self.hidden = _blur(_blur(first.reshape(light.size[::-1])))
+            self.hidden = np.log(_blur(_blur(first.reshape(light.size[::-1]))))
 
     def _relative(self, depth: Array) -> Array:
         return self.SHARPNESS * (np.minimum(depth / self.front, 2) - 1)
@@ -136,8 +139,8 @@ class Shadows:
         if self.hidden is not None:
             # A hair that touches a surface is not behind it.
             depth = places[:, 2] * np.float64(0.996 if on_hair else 1.0)
-            seen = _sample(self.hidden, self.CELL * y + 1.5, self.CELL * x + 1.5)
-            result *= np.minimum(seen * np.exp(-self._relative(depth)), 1)
+            first = _sample(self.hidden, self.CELL * y + 1.5, self.CELL * x + 1.5)
+            result *= np.exp(np.minimum(first - self._relative(depth), 0))
         rows, columns = self.total.shape
         inside = (places[:, 2] > 0) & (x > 0) & (y > 0) & (x < columns - 1) & (y < rows - 1)
         return np.where(inside, result, 1).astype(np.float32)
@@ -151,6 +154,7 @@ class Hairs:
     tangents: unit vectors along the hairs, the same shape.
     colors: linear RGB, the same shape.
     drawn: which of the edges between vertices to draw, shape (hairs, vertices - 1).
+    gloss: of the highlight against the light.
     thickness: of a line, in pixels / SUPERSAMPLING.
     width: [m] of a line in the middle of the scene.
     """
@@ -159,6 +163,7 @@ class Hairs:
     tangents: Array
     colors: Array
     drawn: Array
+    gloss: float
     thickness: int
     width: float
 
@@ -170,21 +175,22 @@ class Surfaces:
     """
 
     def __init__(self, meshes: Sequence[Mesh]) -> None:
-        corners, normals, slopes = [np.zeros((0, 3, 3))], [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
+        corners, normals, slopes = ([np.zeros((0, *shape))] for shape in ((3, 3), (3,), (3, 3)))
         for vertices, triangles in meshes:
             corner = vertices[triangles]
             cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
             mean = np.zeros_like(vertices)
             np.add.at(mean, triangles.ravel(), np.repeat(cross, 3, 0))
-            face, mean = _unit(cross)[:, None], _unit(mean)[triangles]
+            face, mean = unit(cross)[:, None], unit(mean)[triangles]
             # A round surface is shaded round; an edge stays sharp.
             normal = np.where(np.sum(face * mean, -1, keepdims=True) > 0.8, mean, face)
+            flat = np.all(np.abs(normal - face) < 1e-6, (1, 2))
             opposite = np.roll(corner, -2, 1) - np.roll(corner, -1, 1)
             twice = np.maximum(np.linalg.norm(cross, axis=-1), 1e-30)[:, None, None]
             gradient = np.cross(face, opposite) / twice  # of the barycentric coordinates
             corners.append(corner)
             normals.append(normal[:, 0])
-            slopes.append(np.einsum("mki,mkj->mij", normal, gradient))
+            slopes.append(np.einsum("mki,mkj,m->mij", normal, gradient, ~flat))
         self.corners = np.concatenate(corners)
         self._normals = np.concatenate(normals).astype(np.float32)
         self._slopes = np.concatenate(slopes).astype(np.float32)
@@ -192,14 +198,17 @@ class Surfaces:
     def normals_at(self, points: Array, which: Array) -> Array:
         """Unit normals, shape (n, 3), at `points` [m] of the triangles `which`."""
         normals = self._normals[which]
-        round_ = np.flatnonzero(np.any(self._slopes != 0, (1, 2))[which])
-        offset = points[round_] - self.corners[which[round_], 0].astype(np.float32)
-        normals[round_] += np.einsum("nij,nj->ni", self._slopes[which[round_]], offset)
-        return _unit(normals)
+        curved = np.flatnonzero(np.any(self._slopes != 0, (1, 2))[which])
+        offset = points[curved] - self.corners[which[curved], 0].astype(np.float32)
+        normals[curved] += np.einsum("nij,nj->ni", self._slopes[which[curved]], offset)
+        return unit(normals)
 
 
-def _unit(vectors: Array) -> Array:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+def unit(vectors: Array) -> Array:
+    """`vectors` of shape (..., 3) scaled to length 1; zero stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    scaled: Array = vectors / np.maximum(length, 1e-30)
+    return scaled
 
 
 def background(size: tuple[int, int]) -> Array:
@@ -254,20 +263,21 @@ def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
     first, last = colors[:, :-1][hairs.drawn], colors[:, 1:][hairs.drawn]
     image[seen] = first[line] * (1 - mix) + last[line] * mix
 
-    s = SUPERSAMPLING
-    return image.reshape(camera.size[1], s, camera.size[0], s, 3).mean((1, 3))
+    n = SUPERSAMPLING
+    coarse: Array = image.reshape(camera.size[1], n, camera.size[0], n, 3).mean((1, 3))
+    return coarse
 
 
 def _lit_hairs(camera: Camera, light: Camera, hairs: Hairs, shadows: Shadows) -> Array:
     """Colours of the vertices as seen, shape (hairs, vertices, 3)."""
-    to_eye = _unit(camera.position - hairs.points).astype(np.float32)
+    to_eye = unit(camera.position - hairs.points).astype(np.float32)
     lit = shadows.light_at(hairs.points.reshape(-1, 3), on_hair=True)
     lit = lit.reshape(hairs.points.shape[:2])
     diffuse, glint = kajiya_kay(hairs.tangents, -light.axes[2].astype(np.float32), to_eye, 40.0)
     # Light from behind the camera, so that no side of a lock is black.
     fill, _ = kajiya_kay(hairs.tangents, -camera.axes[2].astype(np.float32), to_eye, 1.0)
     body = 0.10 + 0.22 * fill * (0.35 + 0.65 * lit) + 0.95 * diffuse * lit
-    color: Array = hairs.colors * body[..., None] + (0.22 * glint * lit)[..., None]
+    color: Array = hairs.colors * body[..., None] + (hairs.gloss * glint * lit)[..., None]
     return color
 
 
@@ -279,23 +289,35 @@ def _paint_surfaces(
     surfaces: Surfaces,
     shadows: Shadows,
 ) -> None:
-    names = (buffer & np.uint64(raster.NOTHING)).astype(np.int64)
-    seen = np.flatnonzero(names != raster.NOTHING)
-    if not len(seen):
+    """Paint what `buffer`, seen by the fine `camera`, holds into `image` (pixels, 3) in place."""
+    n = SUPERSAMPLING
+    columns = camera.size[0]
+    grid = buffer.reshape(-1, n, columns // n, n).transpose(0, 2, 1, 3).reshape(-1, n * n)
+    names = (grid & np.uint64(raster.NOTHING)).astype(np.int64)
+    row, column = np.divmod(np.arange(len(grid)), columns // n)
+    # Inside a triangle one sample a pixel will do; along its edges every one counts.
+    uniform = np.all(names == names[:, :1], -1)
+    whole = np.flatnonzero(uniform & (names[:, 0] != raster.NOTHING))
+    split, part = np.nonzero((names != raster.NOTHING) & ~uniform[:, None])
+    if not len(whole) + len(split):
         return
-    which, depth = names[seen], raster.depth_of(buffer[seen])
-    y, x = np.divmod(seen, camera.size[0])
-    x, y = (x + 0.5).astype(np.float32), (y + 0.5).astype(np.float32)
+    x = np.concatenate([n * column[whole] + n / 2, n * column[split] + part % n + 0.5])
+    y = np.concatenate([n * row[whole] + n / 2, n * row[split] + part // n + 0.5])
+    depth = raster.depth_of(grid)
+    depth = np.concatenate([depth[whole].mean(-1), depth[split, part]])
+    which = np.concatenate([names[whole, 0], names[split, part]])
     points = camera.unproject(x, y, depth)
     normals = surfaces.normals_at(points, which)
-    to_eye = _unit(camera.position.astype(np.float32) - points)
+    to_eye = unit(camera.position.astype(np.float32) - points)
     normals *= np.sign(np.sum(normals * to_eye, -1, keepdims=True))
-    to_light = -stage.light.axes[2].astype(np.float32)
     lit = shadows.light_at(points, on_hair=False)
-    ambient = 0.34 + 0.14 * normals[:, 2]
-    value = ambient + 0.95 * np.clip(normals @ to_light, 0, 1) * lit
-    color = MESH_COLOR * value[:, None]
+    direct = np.clip(normals @ -stage.light.axes[2].astype(np.float32), 0, 1) * lit
+    color = MESH_COLOR * (0.34 + 0.14 * normals[:, 2:] + 0.95 * direct[:, None])
     away = np.linalg.norm(points - stage.centre.astype(np.float32), axis=-1) / stage.radius
     fade = np.clip((away - 1.5) / 3.5, 0, 1)[:, None]
     fade = fade * fade * (3 - 2 * fade)
-    image[seen] = color * (1 - fade) + image[seen] * fade
+    first = n * row * columns + n * column
+    index = [first[whole] + i // n * columns + i % n for i in range(n * n)]
+    edge = first[split] + part // n * columns + part % n
+    for place, rows in [(i, slice(len(whole))) for i in index] + [(edge, slice(len(whole), None))]:
+        image[place] = color[rows] + fade[rows] * (image[place] - color[rows])

@@ -42,7 +42,7 @@ class PositionBased:
 
     iterations: int = static(default=5)
     sweep: str = static(default="red-black")
-    orientation_weight: Any = 0.1
+    orientation_weight: Any = 0.03
 
     def __post_init__(self) -> None:
         check.whole("solver.iterations", self.iterations, least=1)

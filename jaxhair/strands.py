@@ -70,7 +70,9 @@ class Strands:
         check.shape("strands.positions", self.positions, ("strands", "points", 3))
         strands, points, _ = np.shape(self.positions)
         if points < 2:
-            raise ValueError(f"strands.positions has {points} point a strand; it must have 2 or more")
+            raise ValueError(
+                f"strands.positions has {points} point a strand; it must have 2 or more"
+            )
         check.finite("strands.positions", self.positions)
         check.shape("strands.orientations", self.orientations, (strands, points - 1, 4))
         check.finite("strands.orientations", self.orientations)
@@ -95,7 +97,9 @@ class Strands:
         if shape is not None and shape.size:
             norm = np.linalg.norm(shape, axis=-1).max()
             if norm > 1 + 1e-6:
-                raise ValueError(f"strands.natural_shape has a norm of {norm}; it must be at most 1")
+                raise ValueError(
+                    f"strands.natural_shape has a norm of {norm}; it must be at most 1"
+                )
 
     @property
     def count(self) -> int:

@@ -66,9 +66,7 @@ def numbers(strands: int, points: int, seed: int = 0) -> dict[str, np.ndarray]:
     toward = np.array([1.0, 0, 0]) + rng.normal(0, 0.15, (strands, 3))
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     q = np.zeros((strands, points - 1, 4))
-    q[:, 0] = np.concatenate(
-        [1 + toward[:, 2:], np.cross([0.0, 0.0, 1.0], toward)], axis=1
-    )
+    q[:, 0] = np.concatenate([1 + toward[:, 2:], np.cross([0.0, 0.0, 1.0], toward)], axis=1)
     q[:, 0] /= np.linalg.norm(q[:, 0], axis=-1, keepdims=True)
     p = np.zeros((strands, points, 3))
     p[:, 0] = root
