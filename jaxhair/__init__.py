@@ -1,5 +1,53 @@
 """Differentiable simulation of hair that keeps its shape through side-chain bonds."""
 
+from jaxhair import check, scenes, treatments
+from jaxhair.bonds import Bonds, Cut, Reform
+from jaxhair.contact import HairContact
+from jaxhair.fibre import Fibre, Soften
+from jaxhair.files import Curves, read_curves, write_curves
+from jaxhair.forces import Drag, DryingWind, Gravity, Wind
+from jaxhair.holding import Hold, Wound
+from jaxhair.obstacles import Cylinder, Floor, Sphere
 from jaxhair.pytree import pytree
+from jaxhair.recording import NotFinite, Recording, simulate
+from jaxhair.scene import Phase, Scene, named_leaves, replace_leaves
+from jaxhair.simulate import run
+from jaxhair.solvers import PositionBased
+from jaxhair.strands import BONDS, State, Strands
 
-__all__ = ["pytree"]
+__all__ = [
+    "BONDS",
+    "Bonds",
+    "Curves",
+    "Cut",
+    "Cylinder",
+    "Drag",
+    "DryingWind",
+    "Fibre",
+    "Floor",
+    "Gravity",
+    "HairContact",
+    "Hold",
+    "NotFinite",
+    "Phase",
+    "PositionBased",
+    "Recording",
+    "Reform",
+    "Scene",
+    "Soften",
+    "Sphere",
+    "State",
+    "Strands",
+    "Wind",
+    "Wound",
+    "check",
+    "named_leaves",
+    "pytree",
+    "read_curves",
+    "replace_leaves",
+    "run",
+    "scenes",
+    "simulate",
+    "treatments",
+    "write_curves",
+]

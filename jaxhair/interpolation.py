@@ -82,7 +82,7 @@ class Interpolation:
             lean += self.weights[:, k, None, None] * apart / (1 + far**2) ** 0.5
         lean += self.offset[:, None] * np.minimum(0.35 + 2 * along, 1)[..., None]
         grown: Array = own + lean * (1 - self.clumping[:, None] * along**1.5)[..., None]
-        return grown
+        return grown.astype(points.dtype)
 
 
 def _nearest(places: Array, most: int) -> tuple[Array, Array]:
@@ -94,7 +94,9 @@ def _nearest(places: Array, most: int) -> tuple[Array, Array]:
         rows = np.arange(start, min(start + 512, len(places)))
         square = np.sum((places[rows, None] - places) ** 2, -1)
         square[np.arange(len(rows)), rows] = np.inf
-        index[rows] = np.argsort(square, -1, kind="stable")[:, :count]
+        near = np.argpartition(square, count - 1, -1)[:, :count]
+        order = np.argsort(np.take_along_axis(square, near, -1), -1, kind="stable")
+        index[rows] = np.take_along_axis(near, order, -1)
         distance[rows] = np.sqrt(np.take_along_axis(square, index[rows], -1))
     return index, distance
 
@@ -136,7 +138,7 @@ def bezier(points: Array, counts: Array, pieces: int) -> tuple[Array, Array]:
     slope = np.where((place == last)[..., None], final, slope)
     start, end = here[:, :-1], here[:, 1:]
     control = np.stack([start, start + slope[:, :-1] / 3, end - slope[:, 1:] / 3, end], 2)
-    t = np.arange(pieces) / pieces
+    t = (np.arange(pieces) / pieces).astype(points.dtype)
     value = _bernstein(3, t) @ control
     rate = 3 * _bernstein(2, t) @ np.diff(control, axis=2)
     shape = (len(points), -1, 3)

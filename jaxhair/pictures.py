@@ -135,6 +135,10 @@ def _write_gif(path: Path, scene: "_Scene", fps: float, progress: Progress) -> N
     count = scene.count
     # One palette for all frames, or the background would flicker.
     few = [scene.image(index) for index in sorted({0, count // 2, count - 1})]
+    if scene.bonded is not None:
+        # Fractions between those of the few frames need colours too.
+        light = np.linspace(0.15, 1.15, few[0].shape[0] // 3)[:, None, None]
+        few.append(shading.srgb(light * shading.bonded_color(np.linspace(0, 1, few[0].shape[1]))))
     palette = image.fromarray(np.concatenate(few)).quantize(256)
 
     def coded() -> Iterator[Any]:
@@ -221,7 +225,9 @@ class _Scene:
             place = np.arange(points.shape[1]) * pieces
             rows = [np.interp(steps, place, row) for row in self.bonded[index]]
             colors = shading.bonded_color(np.array(rows))[added.guide]
-        thickness = max(1, round(shading.SUPERSAMPLING * min(camera.size) / 800))
+        # One pixel of 800 where hairs are many, up to two where they are few.
+        pixels = min((2000 / len(curves)) ** 0.25, 2) * min(camera.size) / 800
+        thickness = max(1, round(shading.SUPERSAMPLING * pixels))
         pixel = np.linalg.norm(camera.position - self.stage.centre) / camera.focal
         return shading.Hairs(
             points=curves.astype(np.float32),

@@ -63,9 +63,10 @@ class Camera:
 
     def project(self, points: Array) -> Array:
         """Homogeneous places (x w, y w, w) of `points`, both of shape (..., 3); w is depth [m]."""
-        offset = np.array([[self.focal, 0, 0], [0, self.focal, 0], [*self.half, 1]])
-        matrix = (self.axes.T @ offset).astype(np.float32)
-        return np.asarray((points - self.position).astype(np.float32) @ matrix)
+        lens = np.array([[self.focal, 0, 0], [0, self.focal, 0], [*self.half, 1]])
+        matrix = (self.axes.T @ lens).astype(np.float32)
+        offset = points - self.position.astype(points.dtype)
+        return np.asarray(offset.astype(np.float32, copy=False) @ matrix)
 
     @property
     def half(self) -> tuple[float, float]:
@@ -168,20 +169,24 @@ def lines(
     limit = np.array([width, height], np.float32)
     onscreen = np.all((np.maximum(a, b) >= 0) & (np.minimum(a, b) < limit), -1)
     kept, a, b = kept[onscreen], a[onscreen], b[onscreen]
-    samples = np.ceil(np.max(np.abs(b - a), -1)).astype(np.int64).clip(1, 4 * max(width, height))
-    chunk = np.cumsum(samples) // 2**21
+    depth = start[kept, 2] - np.float32(bias)
+    change = np.stack([*(b - a).T, end[kept, 2] - start[kept, 2]])
+    across, down = np.abs(change[:2])
+    samples = np.ceil(np.maximum(across, down)).astype(np.int64).clip(1, 4 * max(width, height))
+    chunk = np.cumsum(samples) // 2**19
     for piece in range(int(chunk[-1]) + 1 if len(chunk) else 0):
         few = slice(*np.searchsorted(chunk, [piece, piece + 1]))
-        n, lines = samples[few], kept[few]
-        first = np.cumsum(n) - n
-        row = np.repeat(np.arange(len(n)), n)
-        along = (np.arange(len(row)) - first[row] + 0.5).astype(np.float32) / n[row]
-        xy = a[few][row] + along[:, None] * (b[few] - a[few])[row]
-        depth = start[lines, 2][row] + along * (end[lines, 2] - start[lines, 2])[row] - bias
-        key = _key(depth, lines[row] * 64 + (along * 63).astype(np.int64))
-        steep = (np.abs(b - a)[few] @ [-1, 1] > 0)[row]
-        for shift in np.arange(thickness) - (thickness - 1) / 2:
-            x = np.floor(xy[:, 0] + np.float32(shift) * steep).astype(np.int64)
-            y = np.floor(xy[:, 1] + np.float32(shift) * ~steep).astype(np.int64)
-            ok = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            np.minimum.at(buffer, (y * width + x)[ok], key[ok])
+        n = samples[few]
+        along = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        along = (along + np.float32(0.5)).astype(np.float32) / np.repeat(n.astype(np.float32), n)
+        x, y, w = (
+            np.repeat(value[few], n) + along * np.repeat(slope[few], n)
+            for value, slope in zip((a[:, 0], a[:, 1], depth), change, strict=True)
+        )
+        key = _key(w, np.repeat(kept[few] * 64, n) + (along * 63).astype(np.int64))
+        steep = np.repeat((down > across)[few].astype(np.float32), n)
+        for shift in np.arange(thickness, dtype=np.float32) - np.float32((thickness - 1) / 2):
+            column = np.floor(x + shift * steep).astype(np.int64)
+            row = np.floor(y + shift * (1 - steep)).astype(np.int64)
+            ok = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            np.minimum.at(buffer, (row * width + column)[ok], key[ok])

@@ -1,6 +1,7 @@
 """Simulating a whole scene and recording frames of it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -124,7 +125,7 @@ def _traced(scene: Scene, observe: Callable[[State], Any], every: int) -> Any:
     state = start(scene)
     parts = [jax.tree.map(lambda x: x[None], observe(state))]
     for phase in scene.phases:
-        setup = prepare(scene, phase)
+        setup = prepare(scene, phase.effects)
         whole, rest = divmod(phase.steps(scene.dt), every)
 
         def frame(state: State, first: Array, setup: Setup = setup) -> tuple[State, Any]:
@@ -137,6 +138,9 @@ def _traced(scene: Scene, observe: Callable[[State], Any], every: int) -> Any:
             state = advance(setup, state, every * whole, steps=rest)
             parts.append(jax.tree.map(lambda x: x[None], observe(state)))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+_prepare = jax.jit(prepare)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -162,11 +166,11 @@ def _interruptible(
     """Frame by frame, with a progress bar, until the end or Ctrl-C."""
     total = sum(phase.steps(scene.dt) for phase in scene.phases)
     bar = _bar(total, progress)
-    state = start(scene)
+    state, bare = start(scene), replace(scene, phases=())
     frames = [jax.tree.map(np.asarray, observe(state))]
     try:
         for phase in scene.phases:
-            setup = jax.jit(prepare, static_argnums=())(scene, phase)
+            setup = _prepare(bare, phase.effects)
             first = 0
             for steps in _frame_steps(phase, every, scene.dt):
                 state, observed = _frame(observe, setup, state, jnp.int32(first), jnp.int32(steps))

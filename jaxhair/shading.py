@@ -131,7 +131,8 @@ class Shadows:
         places = self.light.project(points)
         x, y, layer = self._cells(places)
         if on_hair:
-            thickness = _sample(self.cloud, y, x, layer)
+            # One layer nearer the light, or a thin sheet of hair would shade itself.
+            thickness = _sample(self.cloud, y, x, layer - 1)
         else:
             behind = np.clip(layer / self.LAYERS * 4 - 0.5, 0, 1)
             thickness = _sample(self.total, y, x) * behind
@@ -207,7 +208,7 @@ class Surfaces:
 def unit(vectors: Array) -> Array:
     """`vectors` of shape (..., 3) scaled to length 1; zero stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    scaled: Array = vectors / np.maximum(length, 1e-30)
+    scaled: Array = vectors / np.maximum(length, length.dtype.type(1e-30))
     return scaled
 
 
@@ -270,7 +271,7 @@ def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
 
 def _lit_hairs(camera: Camera, light: Camera, hairs: Hairs, shadows: Shadows) -> Array:
     """Colours of the vertices as seen, shape (hairs, vertices, 3)."""
-    to_eye = unit(camera.position - hairs.points).astype(np.float32)
+    to_eye = unit(camera.position.astype(np.float32) - hairs.points)
     lit = shadows.light_at(hairs.points.reshape(-1, 3), on_hair=True)
     lit = lit.reshape(hairs.points.shape[:2])
     diffuse, glint = kajiya_kay(hairs.tangents, -light.axes[2].astype(np.float32), to_eye, 40.0)

@@ -1,6 +1,8 @@
 """The step, and the loops that repeat it."""
 
 import math
+from dataclasses import replace
+from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -21,7 +23,7 @@ from jaxhair.fibre import stiffness
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
-from jaxhair.scene import Phase, Scene
+from jaxhair.scene import Scene
 from jaxhair.solvers import PositionBased
 from jaxhair.strands import State, strands_last
 
@@ -75,8 +77,8 @@ def step(setup: Setup, state: State, time: Array) -> State:
     return state
 
 
-def prepare(scene: Scene, phase: Phase) -> Setup:
-    """What stays the same during a phase."""
+def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
+    """What stays the same during a phase with the given effects."""
     strands = scene.strands
     lengths = strands_last(strands.lengths)[:, None]
     ones = jnp.ones((strands.points, 1, 1), lengths.dtype)
@@ -91,11 +93,11 @@ def prepare(scene: Scene, phase: Phase) -> Setup:
     points_free, edges_free = jnp.ones_like(ones, bool), jnp.ones_like(ones[1:], bool)
     if strands.ragged:
         points_free, edges_free = rod.point_exists(), rod.edge_exists()
-    for effect in of_kind(phase.effects, HoldingEffect):
+    for effect in of_kind(effects, HoldingEffect):
         points_free = points_free & ~effect.held_points(rod)
         edges_free = edges_free & ~effect.held_edges(rod)
     k = stiffness(scene.fibre, rod.distance())
-    for soft in of_kind(phase.effects, StiffnessEffect):
+    for soft in of_kind(effects, StiffnessEffect):
         k = jnp.clip(soft.scaled(k), 0, 1)
     rod = Rod(
         lengths=lengths,
@@ -105,7 +107,7 @@ def prepare(scene: Scene, phase: Phase) -> Setup:
         influence=rod.influence,
         ragged=strands.ragged,
     )
-    return Setup(rod, phase.effects, scene.solver, scene.dt)
+    return Setup(rod, effects, scene.solver, scene.dt)
 
 
 def start(scene: Scene) -> State:
@@ -155,15 +157,28 @@ def _near_square_root(steps: int) -> int:
     return root
 
 
+@partial(jax.jit, static_argnames="steps")
+def phase_end(scene: Scene, effects: tuple[Effect, ...], state: State, *, steps: int) -> State:
+    """The state after a phase. Phases that differ only in numbers share the compiled program.
+
+    Arguments:
+        scene: as arrays, without its phases, whose names would be compiled in.
+    """
+    return advance(prepare(scene, effects), state, 0, steps=steps)
+
+
 def run(scene: Scene) -> dict[str, State]:
     """The state at the end of each phase, by the phase's name.
 
     A pure function: `jax.jit`, `grad`, `jvp` and `vmap` work on it, in any leaf of the scene.
+    Without an outer `jit`, phases with the same effects are compiled once.
     """
     scene = scene.as_arrays()
     state = start(scene)
+    bare = replace(scene, phases=())
     ends = {}
     for phase in scene.phases:
-        state = advance(prepare(scene, phase), state, 0, steps=phase.steps(scene.dt))
+        steps = phase.steps(scene.dt)
+        state = phase_end(bare, phase.effects, state, steps=steps)
         ends[phase.name] = state
     return ends

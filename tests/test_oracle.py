@@ -87,7 +87,7 @@ def oracle_settings(scene: Scene) -> oracle.Settings:
 @partial(jax.jit, static_argnums=2)
 def simulated(scene: Scene, state: State, steps: int) -> State:
     scene = scene.as_arrays()
-    setup = prepare(scene, scene.phases[0])
+    setup = prepare(scene, scene.phases[0].effects)
     if steps == 1:
         return step(setup, state, jnp.zeros((), scene.dtype))
     return advance(setup, state, 0, steps=steps)

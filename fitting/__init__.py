@@ -1,0 +1,1 @@
+"""Inverse design of hair: which numbers of a scene give a wanted curl."""

@@ -1,0 +1,296 @@
+"""Fitting the numbers of a scene to wanted shapes."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+from scipy.optimize import least_squares
+
+from fitting.determined import Direction, undetermined
+from fitting.parameters import Constraint, Parameters
+from fitting.targets import Target
+from jaxhair import Scene, check, run
+from jaxhair.strands import strands_first, strands_last
+
+Progress = Callable[[int, float], None]
+
+METHODS = ("levenberg-marquardt", "adam", "l-bfgs")
+MM = 1e3
+"""Millimetres in a metre: residuals are fitted in mm."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a fit found.
+
+    Arguments:
+        values: of each parameter, by the name it was freed with.
+        residual_mm: root mean square distance between simulated and wanted points [mm].
+        residuals_mm: the same for each state.
+        converged: whether the optimiser met its tolerance.
+        undetermined: combinations of numbers that the data do not determine; empty if all are.
+        singular_values: of the residuals' Jacobian in the free numbers [mm].
+        scene: with the values put in.
+        simulated, wanted: points [m] of each state, shape (strands, points, 3); the simulated
+            ones moved onto the wanted ones where the target asks for that.
+        steps: of the optimiser. seconds: that it took, compilation included.
+    """
+
+    values: dict[str, np.ndarray]
+    residual_mm: float
+    residuals_mm: dict[str, float]
+    converged: bool
+    undetermined: tuple[Direction, ...]
+    singular_values: np.ndarray
+    scene: Scene
+    simulated: dict[str, np.ndarray]
+    wanted: dict[str, np.ndarray]
+    steps: int
+    seconds: float
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        from fitting.report import table
+
+        return table(self)
+
+
+class Problem:
+    """Residuals, and their Jacobian, as functions of the free numbers."""
+
+    def __init__(self, parameters: Parameters, targets: Mapping[str, Target]) -> None:
+        self.parameters = parameters
+        self.targets = dict(targets)
+        self._evaluate = jax.jit(self._residuals_and_jacobian)
+        self._last: tuple[bytes, Any] = (b"", None)
+
+    def states(self, free: Array) -> dict[str, Array]:
+        """Of each state the residuals [m], shape (points, 3, strands)."""
+        scene = self.parameters.apply(free)
+        ends = run(scene)
+        return {
+            name: target.residuals(ends[name], self.lengths)
+            for name, target in self.targets.items()
+        }
+
+    @property
+    def lengths(self) -> Array:
+        """Rest lengths [m], shape (points - 1, 1, strands or 1)."""
+        scene = self.parameters.scene
+        return strands_last(jnp.asarray(scene.strands.lengths, scene.dtype))[:, None]
+
+    def residuals(self, free: Array) -> tuple[Array, dict[str, Array]]:
+        """All residuals [mm], shape (n,), and those of each state [m]."""
+        states = self.states(free)
+        return MM * jnp.concatenate([r.ravel() for r in states.values()]), states
+
+    def _residuals_and_jacobian(self, free: Array) -> Any:
+        """One primal run, and its derivative in all directions at once."""
+        residuals, derivative, states = jax.linearize(self.residuals, free, has_aux=True)
+        directions = jnp.eye(free.size, dtype=free.dtype)
+        return residuals, jax.vmap(derivative, out_axes=-1)(directions), states
+
+    def evaluate(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Residuals [mm], their Jacobian, shape (n, free numbers), and residuals by state [m].
+
+        One compiled program for all; the last result is kept, since optimisers ask for the
+        residuals and for the Jacobian of the same point one after the other.
+        """
+        point = jnp.asarray(free, self.parameters.scene.dtype)
+        key = np.asarray(point).tobytes()
+        if self._last[0] != key:
+            residuals, jacobian, states = self._evaluate(point)
+            arrays = (np.asarray(residuals, float), np.asarray(jacobian, float))
+            self._last = (key, (*arrays, jax.tree.map(np.asarray, states)))
+        found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] = self._last[1]
+        return found
+
+
+def fit(
+    scene: Scene,
+    targets: Mapping[str, Target],
+    free: Mapping[str, Constraint],
+    *,
+    method: str = "levenberg-marquardt",
+    steps: int = 50,
+    tolerance: float = 1e-4,
+    learning_rate: float = 0.05,
+    noise_mm: float = 0.1,
+    progress: Progress | None = None,
+) -> Fit:
+    """The numbers of a scene with which its hair takes the wanted shapes.
+
+    The least sum of squared distances between simulated and wanted points over all states.
+
+    Arguments:
+        scene: with the values to start from.
+        targets: from the name of a phase to the shape wanted at its end. One state of the hair
+            rarely determines all influences: observe it in several.
+        free: from a leaf's name to its constraint, see `Parameters`.
+        method: "levenberg-marquardt" with forward-mode Jacobians for few parameters; "adam" or
+            "l-bfgs" with reverse-mode gradients for many.
+        steps: largest number of the optimiser's steps, each a simulation with its derivatives.
+        tolerance: relative, at which a fit has converged.
+        learning_rate: of Adam, in free numbers.
+        noise_mm: error of the target's points [mm], at least which is assumed where the result
+            says what the data do not determine.
+        progress: called with the number of simulations so far and the residual [mm].
+
+    Raises ValueError for an unknown phase, leaf or method.
+    """
+    check.choice("method", method, METHODS)
+    check.whole("steps", steps, least=1)
+    check.positive("tolerance", tolerance)
+    check.positive("noise_mm", noise_mm)
+    if not targets:
+        raise ValueError("targets is empty; it must name at least one phase")
+    for name in targets:
+        scene.phase(name)
+    problem = Problem(Parameters(scene, free), dict(targets))
+    begin = time.perf_counter()
+    if method == "levenberg-marquardt":
+        best, taken, converged = _levenberg_marquardt(problem, steps, tolerance, progress)
+    else:
+        best, taken, converged = _gradient_descent(
+            problem, method, steps, tolerance, learning_rate, progress
+        )
+    seconds = time.perf_counter() - begin
+    settings = {
+        "method": method,
+        "steps": steps,
+        "tolerance": tolerance,
+        "noise_mm": noise_mm,
+        "free": {name: repr(constraint) for name, constraint in free.items()},
+    }
+    return _result(problem, best, taken, converged, seconds, noise_mm, settings)
+
+
+def _levenberg_marquardt(
+    problem: Problem, steps: int, tolerance: float, progress: Progress | None
+) -> tuple[np.ndarray, int, bool]:
+    """MINPACK's Levenberg-Marquardt, in float64 around a simulation of any precision.
+
+    A library that traces the whole optimisation compiles the simulation several times over; here
+    it is one program, called from outside (measured on four states: 20 s against 113 s).
+    """
+    taken = 0
+
+    def residuals(free: np.ndarray) -> np.ndarray:
+        nonlocal taken
+        taken += 1
+        found = problem.evaluate(free)[0]
+        if progress is not None:
+            progress(taken, _rms(found))
+        return np.where(np.isfinite(found), found, 1e6)
+
+    def jacobian(free: np.ndarray) -> np.ndarray:
+        return np.nan_to_num(problem.evaluate(free)[1])
+
+    start = np.asarray(problem.parameters.packed(), float)
+    solution = least_squares(
+        residuals,
+        start,
+        jac=jacobian,
+        method="lm" if residuals(start).size >= start.size else "trf",
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=1e-12,
+        max_nfev=steps,
+    )
+    return solution.x, taken, bool(solution.status > 0)
+
+
+def _gradient_descent(
+    problem: Problem,
+    method: str,
+    steps: int,
+    tolerance: float,
+    learning_rate: float,
+    progress: Progress | None,
+) -> tuple[np.ndarray, int, bool]:
+    """Adam or L-BFGS on the mean square; converged when it falls by less than the tolerance."""
+
+    def loss(free: Array) -> Array:
+        return jnp.mean(problem.residuals(free)[0] ** 2)
+
+    optimiser: optax.GradientTransformationExtraArgs
+    if method == "adam":
+        optimiser = optax.with_extra_args_support(optax.adam(learning_rate))
+    else:
+        optimiser = optax.lbfgs()
+    value_and_gradient = jax.value_and_grad(loss)
+
+    @jax.jit
+    def update(free: Array, memory: Any) -> tuple[Array, Any, Array]:
+        value, gradient = value_and_gradient(free)
+        extra = {"value": value, "grad": gradient, "value_fn": loss}
+        change, memory = optimiser.update(gradient, memory, free, **extra)
+        return optax.apply_updates(free, change), memory, value
+
+    free = problem.parameters.packed()
+    memory = optimiser.init(free)
+    best, least, history = free, np.inf, []
+    window = 10 if method == "adam" else 3
+    for step in range(1, steps + 1):
+        new, memory, value = update(free, memory)
+        history.append(float(value))
+        if history[-1] < least:
+            best, least = free, history[-1]
+        if progress is not None:
+            progress(step, float(np.sqrt(3 * history[-1])))
+        if not np.isfinite(history[-1]):
+            return np.asarray(best), step, False
+        if step > window and history[-1 - window] - history[-1] < tolerance * history[-1 - window]:
+            return np.asarray(best), step, True
+        free = new
+    return np.asarray(best), steps, False
+
+
+def _rms(residuals: np.ndarray) -> float:
+    """Root mean square distance of points, from all coordinates' residuals."""
+    return float(np.sqrt(3 * np.mean(residuals**2)))
+
+
+def _result(
+    problem: Problem,
+    best: np.ndarray,
+    taken: int,
+    converged: bool,
+    seconds: float,
+    noise_mm: float,
+    settings: dict[str, Any],
+) -> Fit:
+    parameters, scene = problem.parameters, problem.parameters.scene
+    free = jnp.asarray(best, scene.dtype)
+    residuals, jacobian, states = problem.evaluate(best)
+    residual = _rms(residuals)
+    directions, singular = undetermined(
+        parameters, free, jacobian, noise_mm=max(noise_mm, residual / np.sqrt(3))
+    )
+    wanted, simulated = {}, {}
+    for name, target in problem.targets.items():
+        points = target.points(problem.lengths, scene.strands.count)
+        wanted[name] = np.asarray(strands_first(points))
+        if target.align:
+            wanted[name] = wanted[name] - wanted[name].mean(axis=1, keepdims=True)
+        simulated[name] = wanted[name] + np.asarray(strands_first(states[name]))
+    return Fit(
+        values={name: np.asarray(v) for name, v in parameters.values(free).items()},
+        residual_mm=residual,
+        residuals_mm={name: _rms(MM * r) for name, r in states.items()},
+        converged=converged and bool(np.isfinite(residual)),
+        undetermined=directions,
+        singular_values=singular,
+        scene=parameters.apply(free),
+        simulated=simulated,
+        wanted=wanted,
+        steps=taken,
+        seconds=seconds,
+        settings=settings,
+    )
