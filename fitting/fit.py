@@ -15,7 +15,8 @@ from scipy.optimize import least_squares
 from fitting.determined import Direction, undetermined
 from fitting.parameters import Constraint, Parameters
 from fitting.targets import Target
-from jaxhair import Scene, check, run
+from jaxhair import Scene, run
+from jaxhair import check
 from jaxhair.strands import strands_first, strands_last
 
 Progress = Callable[[int, float], None]
@@ -64,11 +65,21 @@ class Fit:
 class Problem:
     """Residuals, and their Jacobian, as functions of the free numbers."""
 
-    def __init__(self, parameters: Parameters, targets: Mapping[str, Target]) -> None:
+    def __init__(
+        self, parameters: Parameters, targets: Mapping[str, Target], prior_mm: float = 0.0
+    ) -> None:
         self.parameters = parameters
         self.targets = dict(targets)
+        self.prior_mm = prior_mm
+        self.start = parameters.packed()
         self._evaluate = jax.jit(self._residuals_and_jacobian)
         self._last: tuple[bytes, Any] = (b"", None)
+
+    @property
+    def size(self) -> int:
+        """Number of residuals that come from the data."""
+        scene = self.parameters.scene
+        return 3 * scene.strands.points * scene.strands.count * len(self.targets)
 
     def states(self, free: Array) -> dict[str, Array]:
         """Of each state the residuals [m], shape (points, 3, strands)."""
@@ -86,9 +97,13 @@ class Problem:
         return strands_last(jnp.asarray(scene.strands.lengths, scene.dtype))[:, None]
 
     def residuals(self, free: Array) -> tuple[Array, dict[str, Array]]:
-        """All residuals [mm], shape (n,), and those of each state [m]."""
+        """All residuals [mm], shape (n,), and those of each state [m].
+
+        The last ones are the prior's: what a free number's distance from its start weighs.
+        """
         states = self.states(free)
-        return MM * jnp.concatenate([r.ravel() for r in states.values()]), states
+        prior = self.prior_mm * (free - self.start)
+        return jnp.concatenate([*(MM * r.ravel() for r in states.values()), prior]), states
 
     def _residuals_and_jacobian(self, free: Array) -> Any:
         """One primal run, and its derivative in all directions at once."""
@@ -122,6 +137,7 @@ def fit(
     tolerance: float = 1e-4,
     learning_rate: float = 0.05,
     noise_mm: float = 0.1,
+    prior_width: float = 3.0,
     progress: Progress | None = None,
 ) -> Fit:
     """The numbers of a scene with which its hair takes the wanted shapes.
@@ -140,6 +156,9 @@ def fit(
         learning_rate: of Adam, in free numbers.
         noise_mm: error of the target's points [mm], at least which is assumed where the result
             says what the data do not determine.
+        prior_width: how far, in free numbers, a parameter may plausibly be from its start: the
+            standard deviation of a Gaussian prior. It keeps what the data do not determine near
+            the start, and hardly moves what they do: 3 is a factor of 20 in a positive number.
         progress: called with the number of simulations so far and the residual [mm].
 
     Raises ValueError for an unknown phase, leaf or method.
@@ -152,7 +171,8 @@ def fit(
         raise ValueError("targets is empty; it must name at least one phase")
     for name in targets:
         scene.phase(name)
-    problem = Problem(Parameters(scene, free), dict(targets))
+    check.positive("prior_width", prior_width)
+    problem = Problem(Parameters(scene, free), targets, noise_mm / prior_width)
     begin = time.perf_counter()
     if method == "levenberg-marquardt":
         best, taken, converged = _levenberg_marquardt(problem, steps, tolerance, progress)
@@ -166,6 +186,7 @@ def fit(
         "steps": steps,
         "tolerance": tolerance,
         "noise_mm": noise_mm,
+        "prior_width": prior_width,
         "free": {name: repr(constraint) for name, constraint in free.items()},
     }
     return _result(problem, best, taken, converged, seconds, noise_mm, settings)
@@ -186,7 +207,7 @@ def _levenberg_marquardt(
         taken += 1
         found = problem.evaluate(free)[0]
         if progress is not None:
-            progress(taken, _rms(found))
+            progress(taken, _rms(found[: problem.size]))
         return np.where(np.isfinite(found), found, 1e6)
 
     def jacobian(free: np.ndarray) -> np.ndarray:
@@ -217,7 +238,7 @@ def _gradient_descent(
     """Adam or L-BFGS on the mean square; converged when it falls by less than the tolerance."""
 
     def loss(free: Array) -> Array:
-        return jnp.mean(problem.residuals(free)[0] ** 2)
+        return jnp.sum(problem.residuals(free)[0] ** 2) / problem.size
 
     optimiser: optax.GradientTransformationExtraArgs
     if method == "adam":
@@ -269,7 +290,7 @@ def _result(
     parameters, scene = problem.parameters, problem.parameters.scene
     free = jnp.asarray(best, scene.dtype)
     residuals, jacobian, states = problem.evaluate(best)
-    residual = _rms(residuals)
+    residual, jacobian = _rms(residuals[: problem.size]), jacobian[: problem.size]
     directions, singular = undetermined(
         parameters, free, jacobian, noise_mm=max(noise_mm, residual / np.sqrt(3))
     )
@@ -283,7 +304,7 @@ def _result(
     return Fit(
         values={name: np.asarray(v) for name, v in parameters.values(free).items()},
         residual_mm=residual,
-        residuals_mm={name: _rms(MM * r) for name, r in states.items()},
+        residuals_mm={name: _rms(MM * states[name]) for name in problem.targets},
         converged=converged and bool(np.isfinite(residual)),
         undetermined=directions,
         singular_values=singular,

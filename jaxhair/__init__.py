@@ -1,12 +1,13 @@
 """Differentiable simulation of hair that keeps its shape through side-chain bonds."""
 
-from jaxhair import check, scenes, treatments
+from jaxhair import scenes, treatments
 from jaxhair.bonds import Bonds, Cut, Reform
 from jaxhair.contact import HairContact
+from jaxhair.export import save
 from jaxhair.fibre import Fibre, Soften
 from jaxhair.files import Curves, read_curves, write_curves
 from jaxhair.forces import Drag, DryingWind, Gravity, Wind
-from jaxhair.holding import Hold, Wound
+from jaxhair.holding import Hold, Unloaded, Wound
 from jaxhair.obstacles import Cylinder, Floor, Sphere
 from jaxhair.pytree import pytree
 from jaxhair.recording import NotFinite, Recording, simulate
@@ -38,14 +39,15 @@ __all__ = [
     "Sphere",
     "State",
     "Strands",
+    "Unloaded",
     "Wind",
     "Wound",
-    "check",
     "named_leaves",
     "pytree",
     "read_curves",
     "replace_leaves",
     "run",
+    "save",
     "scenes",
     "simulate",
     "treatments",

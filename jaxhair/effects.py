@@ -72,8 +72,8 @@ class PoseEffect(Effect):
     """Prescribes the whole pose, so that nothing moves by itself: hair fixed on a rod."""
 
     @abstractmethod
-    def pose(self, rod: "Rod", positions: Array, orientations: Array) -> tuple[Array, Array]:
-        """The prescribed positions and orientations."""
+    def pose(self, rod: "Rod", state: "State") -> tuple[Array, Array]:
+        """The prescribed positions and orientations, given the state after bonds broke."""
 
 
 class BondEffect(Effect):

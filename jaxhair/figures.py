@@ -35,6 +35,7 @@ def optional(module: str) -> Any:
 
 
 def check_suffix(path: PathLike, *allowed: str) -> str:
+    """The suffix of `path` in lower case, which must be one of `allowed`."""
     suffix = Path(path).suffix.lower()
     if suffix not in allowed:
         raise ValueError(f"path is {str(path)!r}; its name must end in {' or '.join(allowed)}")
@@ -110,6 +111,8 @@ def _paired(
     """Target and fit of each state."""
     states = []
     for name, value in (("target", target), ("fitted", fitted)):
+        if not len(value):
+            raise ValueError(f"{name} is empty; it must have one state or more")
         arrays = [np.asarray(value)] if np.ndim(value[0]) == 2 else [np.asarray(v) for v in value]
         for array in arrays:
             check.shape(name, array, ("strands", "points", 3))

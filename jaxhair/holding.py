@@ -10,7 +10,7 @@ from jaxhair import quaternion as quat
 from jaxhair.effects import HoldingEffect, PoseEffect
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
-from jaxhair.strands import column
+from jaxhair.strands import State, column
 
 
 @pytree
@@ -96,22 +96,51 @@ class Wound(PoseEffect):
         if climb is not None and abs(climb).max() > jnp.pi / 2:
             raise ValueError(f"Wound.climb is {self.climb!r}; it must be in [-pi/2, pi/2]")
 
-    def pose(self, rod: Rod, positions: Array, orientations: Array) -> tuple[Array, Array]:
+    def pose(self, rod: Rod, state: State) -> tuple[Array, Array]:
         """q_(i+1) = q_i r with the vector part l cos(a) / D (cos(a), 0, sin(a)) of r.
 
         Equal edges of length l that turn so lie with their points on a cylinder of diameter D and
         climb at the angle a: a turn by phi moves a point across by D sin(phi / 2) = l cos(a).
         """
         length = (rod.lengths[:-1] + rod.lengths[1:]) / 2
-        climb = jnp.asarray(self.climb, positions.dtype)
-        axis = column(jnp.stack([jnp.cos(climb), jnp.zeros_like(climb), jnp.sin(climb)]), positions)
+        climb = jnp.asarray(self.climb, length.dtype)
+        axis = column(jnp.stack([jnp.cos(climb), jnp.zeros_like(climb), jnp.sin(climb)]), length)
         sine = jnp.clip(length * jnp.cos(climb) / self.diameter, 0, 0.999)
         if rod.ragged:
             sine = jnp.where(rod.edge_exists()[1:], sine, 0)
         turn = jnp.concatenate([jnp.sqrt(1 - sine**2), sine * axis], axis=1)
-        turn = jnp.broadcast_to(turn, (*turn.shape[:2], positions.shape[-1]))
-        q = quat.swept_products(orientations[0], turn)
-        return positions_along(positions[0], rod.lengths, q), q
+        return _from_root(rod, state, turn)
+
+
+@pytree
+class Unloaded(PoseEffect):
+    """Every strand takes, from its first edge on, the shape in which its bonds are free of stress.
+
+    What hair comes to when no force acts on it: sum_j f_j b_j (Omega - Omega_j) = 0. The solvers
+    take many steps to get there, as many more as the square of the number of points.
+    """
+
+    def pose(self, rod: Rod, state: State) -> tuple[Array, Array]:
+        """q_(i+1) = q_i r with the vector part sum_j f_j b_j Omega_j / sum_j f_j b_j of r.
+
+        Where all bonds are cut the present shape stays.
+        """
+        weights = (rod.influence * state.fractions)[:, :, None]
+        whole = jnp.sum(weights, axis=1)
+        cut = whole == 0
+        free = jnp.sum(weights * state.shapes, axis=1) / jnp.where(cut, 1, whole)
+        q = state.orientations
+        present = quat.relative(q[:-1], q[1:])
+        square = jnp.minimum(quat.dot(free, free), 0.999)
+        turn = jnp.concatenate([jnp.sqrt(1 - square), free], axis=1)
+        return _from_root(rod, state, jnp.where(cut, present, turn))
+
+
+def _from_root(rod: Rod, state: State, turn: Array) -> tuple[Array, Array]:
+    """Positions and orientations from the root and the relative rotations at the inner points."""
+    turn = jnp.broadcast_to(turn, (*turn.shape[:2], state.positions.shape[-1]))
+    q = quat.swept_products(state.orientations[0], turn)
+    return positions_along(state.positions[0], rod.lengths, q), q
 
 
 def positions_along(root: Array, lengths: Array, orientations: Array) -> Array:

@@ -120,7 +120,8 @@ def bezier(points: Array, counts: Array, pieces: int) -> tuple[Array, Array]:
 
     Between two points lies a cubic Bezier curve whose inner control points continue the chords
     (Catmull and Rom). points: shape (hairs, points, 3); counts: points in use, at least 2, shape
-    (hairs,); both results have the shape (hairs, (points - 1) pieces + 1, 3).
+    (hairs,), beyond which a curve stays where it is. Both results have the shape (hairs,
+    (points - 1) pieces + 1, 3).
     """
     last = (counts - 1)[:, None]
     place = np.arange(points.shape[1])
@@ -143,7 +144,11 @@ def bezier(points: Array, counts: Array, pieces: int) -> tuple[Array, Array]:
     rate = 3 * _bernstein(2, t) @ np.diff(control, axis=2)
     shape = (len(points), -1, 3)
     curve = np.concatenate([value.reshape(shape), end[:, -1:]], 1)
-    return curve, np.concatenate([rate.reshape(shape), slope[:, -1:]], 1)
+    rate = np.concatenate([rate.reshape(shape), slope[:, -1:]], 1)
+    if np.min(counts) < points.shape[1]:
+        upto = np.minimum(np.arange(curve.shape[1]), last * pieces)[..., None]
+        curve, rate = (np.take_along_axis(x, upto, 1) for x in (curve, rate))
+    return curve, rate
 
 
 def _bernstein(degree: int, t: Array) -> Array:

@@ -150,7 +150,9 @@ def _write_gif(path: Path, scene: "_Scene", fps: float, progress: Progress) -> N
     ends = [round(100 * index / fps) for index in range(count + 1)]
     durations = [10 * (end - start) for start, end in itertools.pairwise(ends)]
     frames = coded()
-    next(frames).save(path, save_all=True, append_images=frames, duration=durations, loop=0)
+    options = {"append_images": frames, "duration": durations, "loop": 0}
+    with path.open("wb") as file:
+        next(frames).save(file, "GIF", save_all=True, **options)
 
 
 class _Scene:
@@ -296,17 +298,17 @@ def _stage(
 
 
 def _box(frames: Array, meshes: Sequence[Sequence[Mesh]], axes: Array) -> tuple[Array, Array]:
-    """Lowest and highest coordinates along `axes` of all hair and of what stands near it."""
+    """Lowest and highest coordinates along `axes` of all hair and of the smaller obstacles."""
     hair = [frame.reshape(-1, 3) @ axes.T for frame in frames]
     low = np.min([places.min(0) for places in hair], 0)
     high = np.max([places.max(0) for places in hair], 0)
-    grown = 0.3 * np.max(high - low)
-    least, most = low - grown, high + grown
+    # A head belongs into the picture; a floor or a long rod may leave it.
+    largest = np.max(high - low)
     for frame in meshes:
         for vertices, _ in frame:
             places = vertices @ axes.T
-            near = places[np.all((places >= least) & (places <= most), -1)]
-            low, high = np.min([low, *near], 0), np.max([high, *near], 0)
+            if np.max(np.ptp(places, axis=0)) <= largest:
+                low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
     return low, high
 
 

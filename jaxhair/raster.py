@@ -136,14 +136,15 @@ def triangles(camera: Camera, corners: Array, near: float) -> Array:
         for start in range(0, len(which), step):
             few = which[start : start + step]
             spans = (size, size) if size else tuple(high[few[0]] - low[few[0]])
-            x = low[few, 0, None] + np.arange(spans[0])
-            y = low[few, 1, None] + np.arange(spans[1])
-            m = inverse[few].astype(np.float32)[:, None, None]
-            fx, fy = (x + np.float32(0.5))[:, None, :], (y + np.float32(0.5))[:, :, None]
-            fx, fy = fx.astype(np.float32), fy.astype(np.float32)
-            weights = [fx * m[..., 0, k] + (fy * m[..., 1, k] + m[..., 2, k]) for k in range(3)]
-            inside = (weights[0] >= 0) & (weights[1] >= 0) & (weights[2] >= 0)
-            per_depth = weights[0] + weights[1] + weights[2]
+            right, down = (np.arange(n, dtype=np.float32) for n in spans)
+            x, y = low[few, 0, None] + np.arange(spans[0]), low[few, 1, None] + np.arange(spans[1])
+            corner = np.pad(low[few] + 0.5, ((0, 0), (0, 1)), constant_values=1)
+            first = np.einsum("ni,nik->kn", corner, inverse[few]).astype(np.float32)
+            by_x, by_y = inverse[few, :2].transpose(1, 2, 0)[..., None, None].astype(np.float32)
+            weights = by_x * right + (by_y * down[:, None] + first[..., None, None])
+            per_depth = weights.sum(0)
+            # Rounding must leave no gap between triangles that share an edge.
+            inside = np.all(weights >= -1e-5 * per_depth, 0)
             inside &= (per_depth > 0) & (per_depth < 1 / near)
             inside &= (x < width)[:, None, :] & (y < height)[:, :, None]
             place = np.broadcast_to(y[:, :, None] * width + x[:, None, :], inside.shape)[inside]

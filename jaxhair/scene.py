@@ -119,6 +119,18 @@ class Scene:
         """This scene with further phases behind its own."""
         return replace(self, phases=(*self.phases, *phases))
 
+    def first(self, seconds: float) -> "Scene":
+        """This scene up to a simulated time [s], above 0."""
+        check.shape("seconds", seconds, ())
+        check.positive("seconds", seconds)
+        kept: list[Phase] = []
+        left = round(seconds / self.dt)
+        for phase in self.phases:
+            if (steps := min(left, phase.steps(self.dt))) > 0:
+                kept.append(replace(phase, duration=steps * self.dt))
+            left -= steps
+        return replace(self, phases=tuple(kept))
+
     def phase(self, name: str) -> Phase:
         """The phase of a name. Raises ValueError if there is none."""
         for phase in self.phases:
@@ -146,7 +158,7 @@ class Scene:
 
 
 def named_leaves(scene: Scene) -> dict[str, Any]:
-    """Every number of a scene by its name, such as "bonds.influence" or "phases.wind.Gravity.acceleration".
+    """Every number of a scene by its name, such as "phases.wind.Gravity.acceleration".
 
     An effect goes by its class; where a phase has several of one class, the second is "Hold2".
     """

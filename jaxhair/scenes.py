@@ -44,11 +44,11 @@ def bed_hair(
     """
     rng = np.random.default_rng(seed)
     head, gap = 0.09, 0.02  # radius of the head, and space below the tips at the start [m]
-    down = _cap(strands, half_angle=0.6) + rng.normal(0, 0.02, (strands, 3))
-    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    outward = _cap(strands, half_angle=0.6)
+    down = outward * (0.3, 0.3, 1.0) + rng.normal(0, 0.03, (strands, 3))
     centre = np.array([0.0, 0.0, length + gap + head])
     drop = length + gap - 0.05
-    hair = Strands.straight(centre + head * down, down, length=length, points=points)
+    hair = Strands.straight(centre + head * outward, down, length=length, points=points)
     always = _always(contact)
 
     def head_at(moved: float, speed: float) -> tuple[Effect, ...]:
@@ -162,6 +162,7 @@ def perm(
             disulfide_left=disulfide_left if treated else 1.0,
             seconds=seconds,
             free=free,
+            unload=False,
         )
         if not treated:
             phases = phases[-1:]

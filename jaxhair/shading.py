@@ -106,7 +106,7 @@ class Shadows:
             np.clip(np.round(p).astype(np.int64), 0, n - 1)
             for p, n in zip(self._cells(places), (cells[1], cells[0], cells[2]), strict=True)
         )
-        area = (np.mean(depth) / light.focal * self.CELL) ** 2
+        area = (float(depth.min() + depth.max()) / 2 / light.focal * self.CELL) ** 2
         cloud = np.bincount(
             (row * cells[1] + column) * cells[2] + layer, lengths * width / area, np.prod(cells)
         )
@@ -315,7 +315,7 @@ def _paint_surfaces(
     direct = np.clip(normals @ -stage.light.axes[2].astype(np.float32), 0, 1) * lit
     color = MESH_COLOR * (0.34 + 0.14 * normals[:, 2:] + 0.95 * direct[:, None])
     away = np.linalg.norm(points - stage.centre.astype(np.float32), axis=-1) / stage.radius
-    fade = np.clip((away - 1.5) / 3.5, 0, 1)[:, None]
+    fade = np.clip((away - 1.1) / 1.4, 0, 1)[:, None]
     fade = fade * fade * (3 - 2 * fade)
     first = n * row * columns + n * column
     index = [first[whole] + i // n * columns + i % n for i in range(n * n)]

@@ -50,20 +50,20 @@ def step(setup: Setup, state: State, time: Array) -> State:
     p, q, v = state.positions, state.orientations, state.velocities
     # 1. External forces, and the bonds that break. 2a. Interactions that change velocities.
     fractions, rises = bond.changes(of_kind(effects, BondEffect), rod, state, dt)
-    for effect in of_kind(effects, VelocityEffect):
-        v = v + effect.velocity_change(rod, state, dt)
+    for force in of_kind(effects, VelocityEffect):
+        v = v + force.velocity_change(rod, state, dt)
 
     if of_kind(effects, PoseEffect):
-        for effect in of_kind(effects, PoseEffect):
-            p, q = effect.pose(rod, p, q)
+        for pose in of_kind(effects, PoseEffect):
+            p, q = pose.pose(rod, replace(state, fractions=fractions))
         v = jnp.zeros_like(v)
     else:
         # 2b. Prediction; held points move; obstacles.
         p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
-        for effect in of_kind(effects, HoldingEffect):
-            p, q = effect.moved(rod, p, q, time, dt)
-        for effect in of_kind(effects, PositionEffect):
-            p = effect.projected(rod, p, state.positions, time, dt)
+        for holding in of_kind(effects, HoldingEffect):
+            p, q = holding.moved(rod, p, q, time, dt)
+        for obstacle in of_kind(effects, PositionEffect):
+            p = obstacle.projected(rod, p, state.positions, time, dt)
         # 3. The rest shape that the bonds make.
         r = rods.darboux(q[:-1], q[1:])
         rest = bond.rest_shape(state.shapes, fractions, rod.influence, r)
@@ -93,9 +93,9 @@ def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
     points_free, edges_free = jnp.ones_like(ones, bool), jnp.ones_like(ones[1:], bool)
     if strands.ragged:
         points_free, edges_free = rod.point_exists(), rod.edge_exists()
-    for effect in of_kind(effects, HoldingEffect):
-        points_free = points_free & ~effect.held_points(rod)
-        edges_free = edges_free & ~effect.held_edges(rod)
+    for holding in of_kind(effects, HoldingEffect):
+        points_free = points_free & ~holding.held_points(rod)
+        edges_free = edges_free & ~holding.held_edges(rod)
     k = stiffness(scene.fibre, rod.distance())
     for soft in of_kind(effects, StiffnessEffect):
         k = jnp.clip(soft.scaled(k), 0, 1)

@@ -13,7 +13,7 @@ from typing import Any
 from jaxhair.bonds import Cut, Reform
 from jaxhair.effects import Effect
 from jaxhair.forces import Drag, Gravity
-from jaxhair.holding import Hold, Wound
+from jaxhair.holding import Hold, Unloaded, Wound
 from jaxhair.scene import Phase
 from jaxhair.strands import BONDS
 
@@ -32,6 +32,7 @@ def wound_treatment(
     climb: Any = 0.0,
     seconds: float = 1.0,
     free: Sequence[Effect] = HANGING,
+    unload: bool = True,
 ) -> tuple[Phase, ...]:
     """Hair is wound on a rod, bonds are cut and re-formed there, and it is released.
 
@@ -42,12 +43,15 @@ def wound_treatment(
         name: of the last phase. cut: the bonds that break.
         rod_diameter: [m]. climb: of the winding [rad], see `Wound`.
         seconds: that the hair hangs free at the end. free: the effects then.
+        unload: the released hair first takes the shape free of stress, see `Unloaded`; otherwise
+            it uncoils from the rod in the given time.
     """
     rod = Wound(rod_diameter, climb)
     kinds = [kind for kind in BONDS if getattr(cut, kind) is not None]
     return (
         Phase(f"{name}, wound", AT_ONCE, (rod, cut)),
         Phase(f"{name}, set", AT_ONCE, (rod, Reform(**dict.fromkeys(kinds, 1.0)))),
+        *((Phase(f"{name}, unloaded", AT_ONCE, (Unloaded(),)),) if unload else ()),
         Phase(name, seconds, tuple(free)),
     )
 
@@ -75,15 +79,25 @@ def perm(*, disulfide_left: Any = 0.8, **options: Any) -> tuple[Phase, ...]:
 
 
 def wash(
-    *, name: str = "washed", seconds: float = 1.0, free: Sequence[Effect] = HANGING
+    *,
+    name: str = "washed",
+    seconds: float = 1.0,
+    free: Sequence[Effect] = HANGING,
+    unload: bool = True,
 ) -> tuple[Phase, ...]:
     """A wash: the hair is wetted and dried hanging free, and forgets what hydrogen bonds held.
 
     Hydrogen bonds are cut; the wet hair hangs for the given time; they re-form in the shape that
     it then has, and it hangs as long again.
+
+    Arguments:
+        seconds: that the hair hangs wet, and then dry. free: the effects then.
+        unload: the wet hair first takes the shape free of stress, see `Unloaded`.
     """
+    wet = Cut(hydrogen=0.0)
     return (
-        Phase(f"{name}, wet", seconds, (*free, Cut(hydrogen=0.0))),
+        *((Phase(f"{name}, unloaded", AT_ONCE, (Unloaded(), wet)),) if unload else ()),
+        Phase(f"{name}, wet", seconds, (*free, wet)),
         Phase(f"{name}, dried", AT_ONCE, (*free, Reform(hydrogen=1.0))),
         Phase(name, seconds, tuple(free)),
     )

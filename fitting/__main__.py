@@ -1,0 +1,126 @@
+"""The command line: `python -m fitting --output DIR` fits bond influences and cuticle wear."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fitting.fit import METHODS, fit
+from fitting.measured import Measured, packaged, read
+from fitting.parameters import Constraint, Positive, Simplex
+from fitting.report import table, write
+from fitting.strands import STATES, from_strands
+from jaxhair import read_curves
+from jaxhair.__main__ import UNITS, length
+
+FREE: dict[str, Constraint] = {"bonds.influence": Simplex(), "fibre.peeling_rate": Positive()}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line's parser."""
+    top = argparse.ArgumentParser(
+        prog="python -m fitting",
+        description="Finds the bond influences f_j and the cuticle's peeling rate s with which "
+        "hair takes the wanted curls. Without --target it fits curls measured on real hair that "
+        "come with the package.",
+        epilog="example: python -m fitting --target permed=a.hair washed=b.hair --output fitted",
+    )
+    top.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
+    top.add_argument(
+        "--target",
+        nargs="+",
+        metavar="FILE",
+        help="strands (.hair, .data, .npz), each as FILE or STATE=FILE with a STATE of "
+        f"{', '.join(STATES)} (in this order if not named); or one .toml of measured curls",
+    )
+    top.add_argument("--unit", default="m", choices=(*UNITS, "inch"), help="of strand files (m)")
+    top.add_argument("--up", default="z", choices=("y", "z"), help="axis of strand files (z)")
+    top.add_argument("--rod-diameter", type=length, help="such as 17mm (0.6 of the curls')")
+    top.add_argument("--strands", type=int, default=16, help="how many to use at most (16)")
+    top.add_argument("--points", type=int, help="points on a simulated strand")
+    top.add_argument("--weight", action="store_true", help="the target hangs under gravity")
+    top.add_argument("--method", choices=METHODS, default=METHODS[0], help=f"({METHODS[0]})")
+    top.add_argument("--steps", type=int, default=50, help="largest number of simulations (50)")
+    top.add_argument("--overwrite", action="store_true", help="replace files in DIR")
+    top.add_argument("--quiet", action="store_true", help="show no progress")
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the fit; returns 0, or 1 if it did not converge, or 2 after a mistake in the request."""
+    options = parser().parse_args(arguments)
+    try:
+        return _fit(options)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _measured(options: argparse.Namespace) -> Measured:
+    """What to fit."""
+    if not options.target:
+        return packaged()
+    if len(options.target) == 1 and options.target[0].endswith(".toml"):
+        return read(options.target[0])
+    unit = {**UNITS, "inch": 0.0254}[options.unit]
+    observed: dict[str, Any] = {}
+    unnamed = iter(STATES)
+    for text in options.target:
+        state, path = _state_and_path(text)
+        if state is None:
+            state = next((s for s in unnamed if s not in observed), None)
+            if state is None:
+                raise ValueError(f"--target has {len(options.target)} files; at most {len(STATES)}")
+        if state in observed:
+            raise ValueError(f"--target has {state!r} twice; states must differ")
+        observed[state] = read_curves(path, unit=unit, up=options.up, skip_short=True)
+    return from_strands(
+        observed,
+        rod_diameter=options.rod_diameter,
+        strands=options.strands,
+        points=options.points,
+        weight=options.weight,
+    )
+
+
+def _state_and_path(text: str) -> tuple[str | None, str]:
+    """STATE=FILE, or a FILE, even one whose name has a "="."""
+    state, equals, path = text.partition("=")
+    if equals and not Path(text).exists():
+        if state not in STATES:
+            raise ValueError(f"--target names {state!r}; it must be one of {', '.join(STATES)}")
+        return state, path
+    return None, text
+
+
+def _fit(options: argparse.Namespace) -> int:
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not options.overwrite and (folder / "fit.json").exists():
+        raise FileExistsError(
+            f"{folder / 'fit.json'} exists: --output must be another folder, or add --overwrite"
+        )
+    measured = _measured(options)
+    if not options.quiet:
+        print(f"Fitting: {measured.title}. The first simulation includes compilation.")
+
+    def progress(simulations: int, residual: float) -> None:
+        print(f"  simulation {simulations:3d}: residual {residual:.4f} mm", flush=True)
+
+    result = fit(
+        measured.scene,
+        measured.targets,
+        FREE,
+        method=options.method,
+        steps=options.steps,
+        progress=None if options.quiet else progress,
+    )
+    print(table(result))
+    written = write(result, folder, overwrite=options.overwrite, target=measured.title)
+    print("wrote " + ", ".join(str(path) for path in written))
+    return 0 if result.converged else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

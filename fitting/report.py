@@ -1,0 +1,124 @@
+"""A fit for people and programs: table, JSON, picture, strands."""
+
+import json
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxhair.files import Curves, write_curves
+from jaxhair.output import new_file
+from jaxhair.strands import BONDS
+
+if TYPE_CHECKING:
+    from fitting.fit import Fit
+
+PACKAGES = ("jaxhair", "jax", "jaxlib", "numpy", "scipy", "optax")
+
+
+def table(fit: "Fit") -> str:
+    """The values, the residuals and what is not determined, as text."""
+    lines = [f"{'parameter':<34} {'value':>12}"]
+    for name, value in fit.values.items():
+        for label, number in _numbered(name, value):
+            lines.append(f"{label:<34} {number:>12.5g}")
+    lines += ["", f"{'state':<34} {'residual':>12}"]
+    for state, residual in fit.residuals_mm.items():
+        lines.append(f"{state:<34} {residual:>9.3f} mm")
+    lines.append(f"{'all':<34} {fit.residual_mm:>9.3f} mm")
+    verb = "converged" if fit.converged else "did NOT converge"
+    lines += ["", f"{verb} after {fit.steps} simulations in {fit.seconds:.1f} s"]
+    if fit.undetermined:
+        lines.append("The data do not determine (change along it, by how much in free numbers):")
+        for direction in fit.undetermined:
+            size = "any" if direction.uncertainty > 1e3 else f"{direction.uncertainty:.2g}"
+            lines.append(f"  {direction}   +- {size}")
+    else:
+        lines.append("The data determine every parameter.")
+    return "\n".join(lines)
+
+
+def _numbered(name: str, value: np.ndarray) -> list[tuple[str, float]]:
+    if value.ndim == 0:
+        return [(name, float(value))]
+    if name == "bonds.influence" and value.shape == (len(BONDS),):
+        return [(f"{name}[{kind}]", float(v)) for kind, v in zip(BONDS, value, strict=True)]
+    return [
+        (f"{name}[{','.join(map(str, place))}]", float(value[place]))
+        for place in np.ndindex(value.shape)
+    ]
+
+
+def as_json(fit: "Fit", **more: Any) -> dict[str, Any]:
+    """The fit as plain data, see `write`."""
+    return {
+        "parameters": {name: {"value": _plain(v)} for name, v in fit.values.items()},
+        "residual_mm": _plain(fit.residual_mm),
+        "residual_mm_by_state": {name: _plain(v) for name, v in fit.residuals_mm.items()},
+        "converged": fit.converged,
+        "undetermined": [
+            {"change": d.change, "uncertainty": _plain(d.uncertainty)} for d in fit.undetermined
+        ],
+        "singular_values": _plain(fit.singular_values),
+        "simulations": fit.steps,
+        "seconds": fit.seconds,
+        "settings": fit.settings,
+        "versions": {"python": platform.python_version(), **_versions()},
+        **more,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Numbers that JSON has: not finite becomes null."""
+    array = np.asarray(value, float)
+    if array.ndim == 0:
+        return float(array) if np.isfinite(array) else None
+    return [_plain(v) for v in array]
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+def write(fit: "Fit", folder: Path, *, overwrite: bool = False, **more: Any) -> list[Path]:
+    """Writes `fit.json`, the fitted strands of each state (`fitted-<state>.hair`) and `fit.png`.
+
+    The folder must exist. The picture needs the extra `pictures`; without it the rest is written.
+    Returns the files. Raises FileExistsError where one exists and `overwrite` is false.
+    """
+    paths = [folder / "fit.json"]
+    with new_file(paths[0], overwrite=overwrite) as temporary:
+        temporary.write_text(json.dumps(as_json(fit, **more), indent=2) + "\n", encoding="utf-8")
+    for state, points in fit.simulated.items():
+        paths.append(folder / f"fitted-{file_name(state)}.hair")
+        counts = np.full(len(points), points.shape[1])
+        write_curves(paths[-1], Curves(points, counts), overwrite=overwrite)
+    try:
+        from jaxhair import pictures
+
+        picture = folder / "fit.png"
+        pictures.comparison(
+            picture,
+            list(fit.wanted.values()),
+            list(fit.simulated.values()),
+            labels=list(fit.wanted),
+            residuals=[f"residual {r:.2f} mm" for r in fit.residuals_mm.values()],
+            overwrite=overwrite,
+        )
+        paths.append(picture)
+    except ImportError as error:
+        print(f"no picture: {error}")
+    return paths
+
+
+def file_name(state: str) -> str:
+    """A state's name as part of a file name."""
+    return "".join(c if c.isalnum() else "-" for c in state).strip("-").replace("--", "-")

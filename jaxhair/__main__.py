@@ -1,0 +1,127 @@
+"""The command line: `python -m jaxhair simulate perm --output perm.png`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from jaxhair import scenes
+from jaxhair.export import check_ending, check_new, save
+from jaxhair.recording import NotFinite, simulate
+from jaxhair.scene import Scene
+from jaxhair.solvers import SWEEPS, PositionBased
+from jaxhair.strands import BONDS
+from jaxhair.treatments import wash
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line's parser."""
+    top = argparse.ArgumentParser(
+        prog="python -m jaxhair", description="Simulates hair whose bonds break and re-form."
+    )
+    commands = top.add_subparsers(dest="command", required=True)
+    run = commands.add_parser(
+        "simulate",
+        help="simulate one of the paper's scenes",
+        description="Simulates a scene and writes arrays (.npz), the last frame's strands (.hair, "
+        ".data), a picture of it (.png) or a movie (.gif, .mp4).",
+        epilog="example: python -m jaxhair simulate perm --rod-diameter 60mm --output perm.gif",
+    )
+    run.add_argument("scene", choices=tuple(scenes.SCENES), help="which scene")
+    run.add_argument("--output", required=True, metavar="FILE", help="file to write")
+    run.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
+    run.add_argument("--strands", type=int, help="number of strands (as in the paper)")
+    run.add_argument("--points", type=int, help="points on a strand (as in the paper)")
+    run.add_argument("--length", type=length, help="of a strand, such as 24cm (as in the paper)")
+    run.add_argument("--rod-diameter", type=length, help="perm only, such as 60mm (60mm)")
+    run.add_argument(
+        "--prepared", action="store_true", help="perm only: start wound, skip the winding"
+    )
+    run.add_argument("--no-contact", action="store_true", help="hairs pass through each other")
+    run.add_argument("--wash", action="store_true", help="wash the hair at the end")
+    run.add_argument("--iterations", type=int, default=5, help="of the solver in a step (5)")
+    run.add_argument("--sweep", choices=SWEEPS, default="red-black", help="order (red-black)")
+    run.add_argument("--steps-per-second", type=float, default=360, help="time steps (360)")
+    run.add_argument("--seconds", type=float, help="stop after this simulated time")
+    run.add_argument("--fps", type=float, default=30.0, help="frames a second (30)")
+    run.add_argument("--seed", type=int, default=0, help="of the roots' places (0)")
+    run.add_argument("--color-by", choices=BONDS, help="show a bonded fraction, blue 0 to red 1")
+    run.add_argument("--quiet", action="store_true", help="show no progress")
+    return top
+
+
+UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+
+
+def length(text: str) -> float:
+    """A length [m] from a text such as "17mm", "24 cm" or "0.24"."""
+    number, unit = text.strip(), 1.0
+    for ending, size in UNITS.items():
+        if number.endswith(ending):
+            number, unit = number.removesuffix(ending), size
+            break
+    try:
+        return float(number) * unit
+    except ValueError:
+        message = f"{text!r} is no length; it must be a number with mm, cm or m, such as 17mm"
+        raise argparse.ArgumentTypeError(message) from None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command; returns 0, or 2 after a mistake in what was asked, or 1 if it failed."""
+    options = parser().parse_args(arguments)
+    try:
+        return _simulate(options)
+    except (ValueError, OSError, ImportError, NotFinite) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1 if isinstance(error, NotFinite) else 2
+
+
+def _scene(options: argparse.Namespace) -> Scene:
+    chosen: dict[str, Any] = {
+        "strands": options.strands,
+        "points": options.points,
+        "length": options.length,
+        "rod_diameter": options.rod_diameter,
+    }
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    if options.prepared:
+        chosen["winding"] = False
+    if options.scene != "perm":
+        for name, flag in (("rod_diameter", "--rod-diameter"), ("winding", "--prepared")):
+            if name in chosen:
+                raise ValueError(f"{flag} is for the perm; the scene is {options.scene!r}")
+    if options.steps_per_second <= 0:
+        raise ValueError(f"--steps-per-second is {options.steps_per_second}; it must be above 0")
+    scene = scenes.by_name(
+        options.scene,
+        seed=options.seed,
+        contact=not options.no_contact,
+        solver=PositionBased(iterations=options.iterations, sweep=options.sweep),
+        dt=1 / options.steps_per_second,
+        **chosen,
+    )
+    if options.wash:
+        scene = scene.then(*wash(free=scene.phases[-1].effects, seconds=2.0, unload=False))
+    return scene if options.seconds is None else scene.first(options.seconds)
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    check_ending(options.output)
+    check_new(options.output, overwrite=options.overwrite)
+    recording = simulate(_scene(options), fps=options.fps, progress=not options.quiet)
+    if not recording.complete:
+        print(f"interrupted: {len(recording.phases)} frames are kept", file=sys.stderr)
+    save(
+        options.output,
+        recording,
+        color_by=options.color_by,
+        overwrite=options.overwrite,
+        progress=not options.quiet,
+    )
+    print(f"{options.output}: {len(recording.phases)} frames, {recording.times[-1]:.2f} s")
+    return 0 if recording.complete else 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,172 @@
+"""A recording as a file: arrays, strands, a picture or a movie, by the file's ending."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxhair import check
+from jaxhair.files import Curves, write_arrays, write_curves
+from jaxhair.obstacles import Mesh, Obstacle
+from jaxhair.output import new_file
+from jaxhair.recording import Recording
+from jaxhair.scene import Scene, named_leaves
+from jaxhair.strands import BONDS
+
+ENDINGS = (".npz", ".hair", ".data", ".png", ".gif", ".mp4")
+
+
+def save(
+    path: str | os.PathLike[str],
+    recording: Recording,
+    *,
+    frame: int = -1,
+    color_by: str | None = None,
+    overwrite: bool = False,
+    progress: bool = False,
+    **drawing: Any,
+) -> None:
+    """Writes a recording; the file's ending chooses how.
+
+    | ending         | holds                                                                    |
+    | -------------- | ------------------------------------------------------------------------ |
+    | `.npz`         | `positions` [m], (frames, strands, points, 3); `fractions`, (frames,     |
+    |                | strands, points - 2, 4); `times` [s]; `phases`, of each frame; `counts`, |
+    |                | points of each strand; `bonds`, the kinds; `scene`, as text; and every   |
+    |                | number of the scene as `parameter:<name>`                                |
+    | `.hair .data`  | the strands of one frame                                                 |
+    | `.png`         | a picture of one frame                                                   |
+    | `.gif .mp4`    | a movie; needs the extra `pictures`, as `.png` does                      |
+
+    Arguments:
+        frame: for what holds one frame; the last.
+        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures.
+        overwrite: replace a file that exists. progress: show a bar for movies.
+        drawing: options of `jaxhair.pictures.Options`.
+
+    Raises ValueError for another ending, kind or frame, and FileExistsError.
+    """
+    ending = check_ending(path)
+    frames = len(recording.phases)
+    check.whole("frame", frame, least=-frames)
+    if frame >= frames:
+        raise ValueError(f"frame is {frame}; it must be below {frames}")
+    if color_by is not None:
+        check.choice("color_by", color_by, BONDS)
+    counts = recording.scene.strands.counts
+    if ending == ".npz":
+        write_arrays(path, as_arrays(recording), overwrite=overwrite)
+    elif ending in (".hair", ".data"):
+        curves = Curves(recording.positions[frame], counts)
+        write_curves(path, curves, overwrite=overwrite)
+    else:
+        _draw(path, recording, frame, color_by, overwrite, progress, drawing)
+
+
+def check_ending(path: str | os.PathLike[str]) -> str:
+    """The path's ending, in lower case. Raises ValueError if no format goes by it."""
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise ValueError(f"output is {str(path)!r}; its name must end in {', '.join(ENDINGS)}")
+    return ending
+
+
+def check_new(path: str | os.PathLike[str], *, overwrite: bool) -> None:
+    """Raises what writing to the path would raise, before any work is done."""
+
+    class Enough(Exception):
+        pass
+
+    try:
+        with new_file(path, overwrite=overwrite):
+            raise Enough
+    except Enough:
+        pass
+
+
+def as_arrays(recording: Recording) -> dict[str, np.ndarray]:
+    """A recording as named arrays, see `save`."""
+    leaves = named_leaves(recording.scene)
+    return {
+        "positions": np.asarray(recording.positions),
+        "fractions": np.asarray(recording.fractions),
+        "times": np.asarray(recording.times),
+        "phases": np.asarray(recording.phases),
+        "counts": recording.scene.strands.counts,
+        "bonds": np.asarray(BONDS),
+        "scene": np.asarray(str(recording.scene)),
+        **{f"parameter:{name}": np.asarray(leaf) for name, leaf in leaves.items()},
+    }
+
+
+def _draw(
+    path: str | os.PathLike[str],
+    recording: Recording,
+    frame: int,
+    color_by: str | None,
+    overwrite: bool,
+    progress: bool,
+    drawing: dict[str, Any],
+) -> None:
+    from jaxhair import pictures
+
+    scene, counts = recording.scene, recording.scene.strands.counts
+    bonded = None if color_by is None else _bonded(recording.fractions, color_by)
+    if Path(path).suffix.lower() == ".png":
+        pictures.picture(
+            path,
+            recording.positions[frame],
+            counts=counts,
+            bonded=None if bonded is None else bonded[frame],
+            meshes=meshes(scene, recording.phases[frame], float(recording.times[frame])),
+            overwrite=overwrite,
+            **drawing,
+        )
+        return
+
+    def bar(frames: range) -> Any:
+        if not progress:
+            return frames
+        from tqdm import tqdm
+
+        return tqdm(frames, unit="frame", desc="drawing")
+
+    times = np.asarray(recording.times)
+    pictures.movie(
+        path,
+        recording.positions,
+        fps=min(50.0, 1 / max(float(np.median(np.diff(times))), 1e-3)) if len(times) > 1 else 30.0,
+        counts=counts,
+        bonded=bonded,
+        meshes=[
+            meshes(scene, phase, float(t)) for phase, t in zip(recording.phases, times, strict=True)
+        ],
+        overwrite=overwrite,
+        progress=bar,
+        **drawing,
+    )
+
+
+def _bonded(fractions: Any, kind: str) -> np.ndarray:
+    """Fractions at all points, (frames, strands, points): the ends have their neighbours'."""
+    inner = np.asarray(fractions)[..., BONDS.index(kind)]
+    if inner.shape[-1] == 0:
+        return np.ones((*inner.shape[:-1], 2))
+    return np.pad(inner, [(0, 0)] * (inner.ndim - 1) + [(1, 1)], mode="edge")
+
+
+def meshes(scene: Scene, phase: str, time: float) -> list[Mesh]:
+    """The obstacles of a scene, to draw.
+
+    Arguments:
+        phase: name; "" is the start, which shows the first phase's obstacles.
+        time: since the start of the scene [s].
+    """
+    begin = 0.0
+    for place in scene.phases:
+        if place.name == phase or not phase:
+            inside = time - begin
+            return [e.mesh(inside) for e in place.effects if isinstance(e, Obstacle)]
+        begin += place.steps(scene.dt) * scene.dt
+    return []
