@@ -28,7 +28,12 @@ class Direction:
 
 
 def undetermined(
-    parameters: Parameters, free: Array, jacobian: np.ndarray, *, noise_mm: float, limit: float = 0.3
+    parameters: Parameters,
+    free: Array,
+    jacobian: np.ndarray,
+    *,
+    noise_mm: float,
+    limit: float = 0.3,
 ) -> tuple[tuple[Direction, ...], np.ndarray]:
     """Directions in which the fitted numbers may move with little change of the shapes.
 

@@ -91,7 +91,9 @@ def curly(length: float, points: int, inverse_diameter: float) -> Strands:
     hair = Strands.straight(np.zeros((1, 3)), (0.0, 0.0, -1.0), length=length, points=points)
     sine = length / (points - 1) * math.cos(CLIMB) * inverse_diameter
     if not 0 <= sine < 1:
-        raise ValueError(f"1 / diameter is {inverse_diameter}; edges must be shorter than diameters")
+        raise ValueError(
+            f"1 / diameter is {inverse_diameter}; edges must be shorter than diameters"
+        )
     shape = sine * jnp.asarray([math.cos(CLIMB), 0.0, math.sin(CLIMB)], hair.lengths.dtype)
     return replace(hair, natural_shape=jnp.broadcast_to(shape, hair.natural_shape.shape))
 
@@ -101,7 +103,9 @@ def _phases(state: Any, rod: float, where: str) -> tuple[str, list[Phase]]:
     if not isinstance(state, dict) or not isinstance(state.get("name"), str):
         raise ValueError(f"{where}: name is missing; it must be a text")
     if unknown := set(state) - STATE_KEYS:
-        raise ValueError(f"{where}: {sorted(unknown)[0]!r} is unknown; known are {sorted(STATE_KEYS)}")
+        raise ValueError(
+            f"{where}: {sorted(unknown)[0]!r} is unknown; known are {sorted(STATE_KEYS)}"
+        )
     name, treatment = state["name"], state.get("treatment")
     if treatment not in TREATMENTS:
         raise ValueError(f"{where}: treatment is {treatment!r}; it must be one of {TREATMENTS}")

@@ -74,7 +74,7 @@ def blow_dry(
     length: float = 0.24,
     seed: int = 0,
     contact: bool = True,
-    strength: float = 250.0,
+    strength: float = 400.0,
     **options: Any,
 ) -> Scene:
     """Scene 2: wet hair is pressed on a floor, a dryer blows on its middle, and it is lifted again.
@@ -88,7 +88,7 @@ def blow_dry(
         strength: of the wind [m/s^2].
         options: of `Scene`, such as fibre, solver or dt.
 
-    Phases: "press" (1 s), "blow" (3 s), "lift" (1 s), "hang" (2 s).
+    Phases: "press" (1 s), "blow" (3 s), "lift" (1 s), "hang" (4 s).
     """
     rng = np.random.default_rng(seed)
     rows = 4
@@ -108,7 +108,7 @@ def blow_dry(
         Phase("press", 1.0, (*always, lowered(low - height), floor)),
         Phase("blow", 3.0, (*always, Hold(), floor, wind)),
         Phase("lift", 1.0, (*always, lowered(height - low), floor)),
-        Phase("hang", 2.0, (*always, Hold(), floor)),
+        Phase("hang", 4.0, (*always, Hold(), floor)),
     )
     return Scene(hair, bonds=WET, phases=phases, **options)
 
@@ -124,7 +124,7 @@ def perm(
     disulfide_left: float = 0.8,
     seed: int = 0,
     contact: bool = True,
-    seconds: float = 3.0,
+    seconds: float = 5.0,
     **options: Any,
 ) -> Scene:
     """Scene 3: dry hair is wound on a rod, its bonds are cut and re-formed there, and it is released.

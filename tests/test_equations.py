@@ -164,6 +164,40 @@ def test_9_10_nothing_turns_where_both_edges_are_held() -> None:
     assert [float(h) for h in rods.bend_twist_factors(zero, zero, zero + 1)] == [0, 0]
 
 
+def test_a_reversed_strand() -> None:
+    """Root and tip exchanged: what stretches and what bends are the same, up to the sweep's order.
+
+    The frames turn by half a turn about e1, which takes e3 to -e3. With three edges the even and
+    the odd ones of red-black stay what they are; with bends they would not, so k = 0 there.
+    """
+    rng = np.random.default_rng(4)
+    x, q = jnp.asarray(rng.normal(0, 0.01, (4, 3, 2))), jnp.asarray(rng.normal(size=(3, 4, 2)))
+    q = quat.unit(q)
+    half = jnp.asarray([0.0, 1.0, 0.0, 0.0])[None, :, None]
+    one = jnp.ones((4, 1, 1))
+    lengths = jnp.asarray([0.01, 0.02, 0.015])[:, None, None]
+    solver = PositionBased(iterations=4)
+
+    def solved(x: jax.Array, q: jax.Array, lengths: jax.Array) -> tuple[jax.Array, jax.Array]:
+        rod = Rod(lengths, one, one[1:], 0 * one[2:], one[:1])
+        return solve(solver, rod, x, q, q[1:])
+
+    p, frames = solved(x, q, lengths)
+    back, back_frames = solved(x[::-1], multiply(q, half)[::-1], lengths[::-1])
+    np.testing.assert_allclose(back[::-1], p, atol=1e-15)
+    np.testing.assert_allclose(back_frames[::-1], multiply(frames, half), atol=1e-13)
+
+    # One bend: Omega of the reversed strand is (-Omega_1, Omega_2, Omega_3).
+    omega = jnp.asarray(rng.uniform(-0.3, 0.3, (1, 3, 2)))
+    flip = jnp.asarray([-1.0, 1.0, 1.0])[None, :, None]
+    factors = rods.bend_twist_factors(one[:1], one[:1] * 3, one[:1] * 0.4)
+    q1, q2 = bend_twist(q[:1], q[1:2], quat.from_vector_part(omega), factors)
+    other = multiply(q[1:2], half), multiply(q[:1], half)
+    r2, r1 = bend_twist(*other, quat.from_vector_part(flip * omega), factors[::-1])
+    np.testing.assert_allclose(r1, multiply(q1, half), atol=1e-14)
+    np.testing.assert_allclose(r2, multiply(q2, half), atol=1e-14)
+
+
 @pytest.mark.parametrize("dtype", TOLERANCE)
 def test_12_stiffness_of_an_iteration(dtype: str) -> None:
     """1 - (1 - k)^(1/n): 0.75 in 2 is 0.5; 0.05 in 5 is 0.0102062; small k is k / n."""
