@@ -47,7 +47,7 @@ def undetermined(
     """
     if not np.all(np.isfinite(jacobian)):
         singular = np.full(len(free), np.nan)
-        everything = {label: 1.0 for label in parameters.labels()}
+        everything = dict.fromkeys(parameters.labels(), 1.0)
         return (Direction(everything, np.inf),), singular
     _, singular, vt = np.linalg.svd(jacobian.astype(float), full_matrices=True)
     singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])

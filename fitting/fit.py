@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 from fitting.determined import Direction, undetermined
 from fitting.parameters import Constraint, Parameters
 from fitting.targets import Target
-from jaxhair import Scene, run
-from jaxhair import check
+from jaxhair import Scene, check, run
 from jaxhair.strands import strands_first, strands_last
 
 Progress = Callable[[int, float], None]

@@ -1,4 +1,4 @@
-"""Side-chain bonds: the rest shape they make, what they remember, and how they break and re-form."""
+"""Side-chain bonds: the rest shape they make, what they remember, how they break and re-form."""
 
 from collections.abc import Sequence
 from typing import Any

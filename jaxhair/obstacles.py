@@ -102,12 +102,12 @@ class Floor(Obstacle):
         self._check_motion()
 
     @property
-    def centre(self) -> Array:  # type: ignore[override]
+    def centre(self) -> Array:
         height = jnp.asarray(self.height)
         return jnp.stack([jnp.zeros_like(height), jnp.zeros_like(height), height])
 
     @property
-    def angular_velocity(self) -> None:  # type: ignore[override]
+    def angular_velocity(self) -> None:
         return None
 
     def surface(self, offset: Array) -> tuple[Array, Array]:

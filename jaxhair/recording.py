@@ -14,7 +14,7 @@ from jaxhair import check
 from jaxhair.pytree import pytree, static
 from jaxhair.scene import Phase, Scene
 from jaxhair.simulate import Setup, advance, prepare, start, step
-from jaxhair.strands import State, strands_first
+from jaxhair.strands import State
 
 
 @pytree
@@ -222,6 +222,6 @@ def _check_finite(recording: Recording) -> None:
     )
     raise NotFinite(
         f"values are not finite from frame {bad} on (t = {recording.times[bad]:g} s, phase "
-        f"{recording.phases[bad]!r}{where}); the {bad} frames before are in this error's .recording",
+        f"{recording.phases[bad]!r}{where}); the frames before are in this error's .recording",
         kept,
     )

@@ -94,7 +94,7 @@ def stretch_shear_violation(p1: Array, p2: Array, q: Array, length: Array) -> Ar
 def stretch_shear(
     p1: Array, p2: Array, q: Array, length: Array, factors: tuple[Array, ...]
 ) -> tuple[Array, Array, Array]:
-    """One projection of stretch and shear: p1 + g1 gamma, p2 - g2 gamma, unit(q + gq gamma q conj(e)).
+    """One projection of stretch-shear: p1 + g1 gamma, p2 - g2 gamma, unit(q + gq gamma q conj(e)).
 
     Arguments:
         p1, p2: ends of an edge [m], shape (..., 3, strands). q: its frame, (..., 4, strands).

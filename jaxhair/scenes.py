@@ -31,7 +31,7 @@ def bed_hair(
     dry: bool = True,
     **options: Any,
 ) -> Scene:
-    """Scene 1: wet hair on the back of a head is pressed on a pillow, dries there, and keeps a bend.
+    """Scene 1: wet hair on a head is pressed on a pillow, dries there, and keeps a bend.
 
     Arguments:
         strands, points: how many, and points on each. length: of a strand [m].
@@ -127,7 +127,7 @@ def perm(
     seconds: float = 5.0,
     **options: Any,
 ) -> Scene:
-    """Scene 3: dry hair is wound on a rod, its bonds are cut and re-formed there, and it is released.
+    """Scene 3: dry hair is wound on a rod, bonds are cut and re-formed there, and it is released.
 
     With points 3 cm apart, as in the paper, the rod must be thick: a curl needs 8 points a turn.
     For a rod as in a salon, 17 mm, take points 6 mm apart and more iterations.

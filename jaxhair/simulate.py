@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax

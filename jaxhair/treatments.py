@@ -57,7 +57,10 @@ def wound_treatment(
 
 
 def water_set(**options: Any) -> tuple[Phase, ...]:
-    """Wet hair dried on a rod: hydrogen bonds are cut and re-formed. Options of `wound_treatment`."""
+    """Wet hair dried on a rod: hydrogen bonds are cut and re-formed.
+
+    Options of `wound_treatment`.
+    """
     return wound_treatment(options.pop("name", "water set"), Cut(hydrogen=0.0), **options)
 
 

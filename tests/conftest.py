@@ -1,4 +1,4 @@
-"""Every test runs with strict dtypes and ranks; float64 is on so that both precisions can be tested."""
+"""All tests run with strict dtypes and ranks; float64 is on, so that both precisions can run."""
 
 import jax
 

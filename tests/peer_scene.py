@@ -57,7 +57,7 @@ class ExchangeIn(Exchange):
 
 
 def numbers(strands: int, points: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Positions, orientations (w x y z), shapes, influence, fractions and exchange, strands first."""
+    """The numbers of the scene, strands first; quaternions are w x y z."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(strands)))
     index = np.arange(strands)

@@ -99,7 +99,7 @@ def test_gradient_methods_find_the_same_curl(method: str) -> None:
             {"water set": target},
             {"bonds.influence": fitting.Simplex()},
             method=method,
-            steps=150,
+            steps=300,
             tolerance=1e-6,
         )
     assert found.values["bonds.influence"][0] == pytest.approx(0.45, abs=2e-3)

@@ -29,7 +29,7 @@ PEERS = 1e-5  # m
 
 
 def random_hair(strands: int, points: int, ragged: bool, seed: int = 1) -> tuple[Strands, State]:
-    """Curly strands close together, moving, each kind of bond with a shape and fraction of its own."""
+    """Curly strands close together, moving; each kind of bond has its own shape and fraction."""
     rng = np.random.default_rng(seed)
     steps = rng.normal(0, 0.4, (strands, points - 1, 3)) + np.array([0.6, 0.0, -0.5])
     steps *= 0.02 * rng.uniform(0.7, 1.3, (strands, points - 1, 1))

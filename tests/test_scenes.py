@@ -146,7 +146,7 @@ def test_scenes_have_the_papers_numbers() -> None:
         scene = make()
         assert scene.strands.count == strands
         assert np.asarray(scene.strands.lengths).sum() == pytest.approx(length)
-        assert 0.33 == pytest.approx((scene.strands.points - 1) / length / 100, rel=0.02)
+        assert (scene.strands.points - 1) / length / 100 == pytest.approx(0.33, rel=0.02)
         assert scene.dt == pytest.approx(1 / 360)
         assert scene.solver.iterations == 5
         assert scene.fibre.stiffness == 0.05
