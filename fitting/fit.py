@@ -234,7 +234,7 @@ def _gradient_descent(
     learning_rate: float,
     progress: Progress | None,
 ) -> tuple[np.ndarray, int, bool]:
-    """Adam or L-BFGS on the mean square; converged when it falls by less than the tolerance."""
+    """Adam or L-BFGS on the mean square, until it falls no more by the relative tolerance."""
 
     def loss(free: Array) -> Array:
         return jnp.sum(problem.residuals(free)[0] ** 2) / problem.size
@@ -255,18 +255,19 @@ def _gradient_descent(
 
     free = problem.parameters.packed()
     memory = optimiser.init(free)
-    best, least, history = free, np.inf, []
-    window = 10 if method == "adam" else 3
+    best, least = free, [np.inf]  # lowest loss after each step; Adam's own goes up and down
+    patience = 25 if method == "adam" else 3
     for step in range(1, steps + 1):
         new, memory, value = update(free, memory)
-        history.append(float(value))
-        if history[-1] < least:
-            best, least = free, history[-1]
+        loss_now = float(value)
         if progress is not None:
-            progress(step, float(np.sqrt(3 * history[-1])))
-        if not np.isfinite(history[-1]):
+            progress(step, float(np.sqrt(3 * loss_now)))
+        if not np.isfinite(loss_now):
             return np.asarray(best), step, False
-        if step > window and history[-1 - window] - history[-1] < tolerance * history[-1 - window]:
+        if loss_now < least[-1]:
+            best = free
+        least.append(min(loss_now, least[-1]))
+        if step > patience and least[-1] > (1 - tolerance) * least[-1 - patience]:
             return np.asarray(best), step, True
         free = new
     return np.asarray(best), steps, False

@@ -46,6 +46,7 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--fps", type=float, default=30.0, help="frames a second (30)")
     run.add_argument("--seed", type=int, default=0, help="of the roots' places (0)")
     run.add_argument("--color-by", choices=BONDS, help="show a bonded fraction, blue 0 to red 1")
+    run.add_argument("--size", type=int, default=800, help="of pictures, pixels (800)")
     run.add_argument("--quiet", action="store_true", help="show no progress")
     return top
 
@@ -118,6 +119,7 @@ def _simulate(options: argparse.Namespace) -> int:
         color_by=options.color_by,
         overwrite=options.overwrite,
         progress=not options.quiet,
+        size=(options.size, options.size),
     )
     print(f"{options.output}: {len(recording.phases)} frames, {recording.times[-1]:.2f} s")
     return 0 if recording.complete else 130

@@ -1,7 +1,7 @@
 """What must not change a simulation: place, signs, order, company, precision and transformation."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -237,7 +237,7 @@ WET = Bonds(fraction=(0.5, 1.0, 1.0, 1.0))
 def test_ragged_and_separate() -> None:
     """A strand of 4 points beside one of 6 moves as it does alone; both of its ends are held."""
     points, phases = curly(2, 6), (Phase("only", 1.0, AIR),)
-    strands = Strands.from_points(points, counts=(6, 4))
+    strands = jax.jit(partial(Strands.from_points, counts=(6, 4)))(points)
     both = final(Scene(strands, bonds=WET, phases=phases))
     alone = final(Scene(from_points(points[1:, :4]), bonds=WET, phases=phases))
     sizes = State(4, 4, 3, 2, 2)  # type: ignore[arg-type]
