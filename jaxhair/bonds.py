@@ -92,11 +92,6 @@ def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
     return shape + new * (present_shape(r, shape) - shape)
 
 
-def kinds_formed(effects: Sequence[BondEffect]) -> tuple[int, ...]:
-    """Places, in `BONDS`, of the kinds that some effect may re-form."""
-    return tuple(j for j, kind in enumerate(BONDS) if any(kind in e.kinds_formed for e in effects))
-
-
 def changes(
     effects: Sequence[BondEffect], rod: Rod, state: State, dt: float
 ) -> tuple[Array, dict[int, Array]]:
@@ -111,18 +106,24 @@ def changes(
     fractions = state.fractions
     rises: dict[int, Array] = {}
     for j, kind in enumerate(BONDS):
+        cutting = [e for e in effects if kind in e.kinds_cut]
+        forming = [e for e in effects if kind in e.kinds_formed]
+        if not cutting and not forming:
+            continue
         before = state.fractions[:, j]
+
+        def change(effect: BondEffect, kind: str = kind, before: Array = before) -> Array:
+            return effect.fraction_change(kind, before, rod, state, dt)
+
         after = before
-        for effect in (e for e in effects if kind in e.kinds_cut):
-            change = effect.fraction_change(kind, before, rod, state, dt)
-            after = after + jnp.minimum(change, 0)
-        if any(kind in e.kinds_cut for e in effects):
+        if cutting:
+            after = before + sum(jnp.minimum(change(e), 0) for e in cutting)
             after = jnp.maximum(after, 0)
             fractions = fractions.at[:, j].set(after)
-        rise = jnp.zeros_like(before)
-        for effect in (e for e in effects if kind in e.kinds_formed):
-            rise = rise + jnp.maximum(effect.fraction_change(kind, before, rod, state, dt), 0)
-        if any(kind in e.kinds_formed for e in effects):
+        if forming:
+            rise = sum(
+                (jnp.maximum(change(e), 0) for e in forming[1:]), jnp.maximum(change(forming[0]), 0)
+            )
             rises[j] = jnp.minimum(rise, 1 - after)
     return fractions, rises
 

@@ -13,20 +13,25 @@ import numpy as np
 
 def known(value: Any) -> np.ndarray | None:
     """`value` as a NumPy array, or None where it is traced and has no value yet."""
-    if isinstance(value, jax.core.Tracer):
-        return None
-    try:
-        return np.asarray(value)
-    except Exception:  # a key array or a foreign object: the caller's shape check reports it
-        return None
+    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+
+
+def _short(value: Any) -> str:
+    """`value` in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _numbers(name: str, value: Any) -> np.ndarray | None:
-    array = known(value)
-    if array is None:
+    if isinstance(value, jax.core.Tracer):
         return None
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        array = np.asarray(None)
     if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name} is {value!r}; it must be a number or an array of numbers")
+        wanted = "it must be a number or an array of numbers"
+        raise ValueError(f"{name} is {_short(value)}; {wanted}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} has {_offender(array, ~np.isfinite(array))}; it must be finite")
     return array
@@ -68,7 +73,11 @@ def fraction(name: str, value: Any) -> None:
 
 def shape(name: str, value: Any, allowed: tuple[int | str, ...]) -> None:
     """`value` has the shape `allowed`, where a string stands for any size above 0."""
-    actual = np.shape(value)
+    try:
+        actual = np.shape(value)
+    except ValueError:  # lists of different lengths
+        _numbers(name, value)
+        raise
     fits = len(actual) == len(allowed) and all(
         size > 0 if isinstance(want, str) else size == want
         for size, want in zip(actual, allowed, strict=True)
@@ -76,6 +85,12 @@ def shape(name: str, value: Any, allowed: tuple[int | str, ...]) -> None:
     if not fits:
         text = ", ".join(str(want) for want in allowed) + ("," if len(allowed) == 1 else "")
         raise ValueError(f"{name} has shape {actual}; it must have shape ({text})")
+
+
+def number(name: str, value: Any) -> None:
+    """`value` is one finite number."""
+    shape(name, value, ())
+    _numbers(name, value)
 
 
 def vector(name: str, value: Any) -> None:
@@ -89,7 +104,23 @@ def direction(name: str, value: Any) -> None:
     vector(name, value)
     array = known(value)
     if array is not None and not np.any(array != 0):
-        raise ValueError(f"{name} is {value!r}; it must not be the zero vector")
+        raise ValueError(f"{name} is {_short(value)}; it must not be the zero vector")
+
+
+def instance(name: str, value: Any, kind: type) -> None:
+    """`value` is of a class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} is {_short(value)}; it must be of class {kind.__name__}")
+
+
+def several(name: str, value: Any, kind: type) -> tuple[Any, ...]:
+    """`value` as a tuple, all of whose entries are of a class."""
+    if not isinstance(value, list | tuple):
+        wanted = f"a tuple, whose entries are of class {kind.__name__}"
+        raise ValueError(f"{name} is {_short(value)}; it must be {wanted}")
+    for entry in value:
+        instance(f"an entry of {name}", entry, kind)
+    return tuple(value)
 
 
 def choice(name: str, value: Any, allowed: Sequence[Any]) -> None:

@@ -33,6 +33,7 @@ class Hold(HoldingEffect):
 
     def __post_init__(self) -> None:
         check.choice("Hold.part", self.part, ("root", "tip"))
+        check.choice("Hold.clamped", self.clamped, (True, False))
         for name in ("velocity", "angular_velocity", "centre"):
             if getattr(self, name) is not None:
                 check.vector(f"Hold.{name}", getattr(self, name))
@@ -90,8 +91,9 @@ class Wound(PoseEffect):
     climb: Any = 0.0
 
     def __post_init__(self) -> None:
+        check.number("Wound.diameter", self.diameter)
         check.positive("Wound.diameter", self.diameter)
-        check.finite("Wound.climb", self.climb)
+        check.number("Wound.climb", self.climb)
         climb = check.known(self.climb)
         if climb is not None and abs(climb).max() > jnp.pi / 2:
             raise ValueError(f"Wound.climb is {self.climb!r}; it must be in [-pi/2, pi/2]")

@@ -1,6 +1,7 @@
 """Obstacles that hair cannot enter, with friction: floor, sphere, cylinder."""
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -54,7 +55,9 @@ class Obstacle(PositionEffect):
         distance, normal = self.surface(positions - centre)
         depth = jnp.maximum(-distance, 0)
         outside = positions + depth * normal
-        slip = outside - previous - self._carried(outside - centre, dt)
+        slip = outside - previous
+        for carried in self._carried(outside - centre, dt):
+            slip = slip - carried
         slip = slip - quat.dot(slip, normal) * normal
         size = quat.safe_norm(slip)
         stop = self.friction * depth
@@ -64,15 +67,13 @@ class Obstacle(PositionEffect):
         touches = (depth > 0) & (rod.point_weights > 0)
         return jnp.where(touches, slowed, positions)
 
-    def _carried(self, offset: Array, dt: float) -> Array:
-        """Displacement of the obstacle's own surface over a step."""
-        moved = jnp.zeros_like(offset)
+    def _carried(self, offset: Array, dt: float) -> Iterator[Array]:
+        """Displacements of the obstacle's own surface over a step, by its motion and its spin."""
         if self.velocity is not None:
-            moved = moved + dt * column(self.velocity, offset)
+            yield dt * column(self.velocity, offset)
         if self.angular_velocity is not None:
             spin = jnp.broadcast_to(column(self.angular_velocity, offset), offset.shape)
-            moved = moved + dt * quat.cross(spin, offset)
-        return moved
+            yield dt * quat.cross(spin, offset)
 
     def _check_motion(self) -> None:
         name = type(self).__name__
@@ -97,8 +98,7 @@ class Floor(Obstacle):
     velocity: Any = None
 
     def __post_init__(self) -> None:
-        check.shape("Floor.height", self.height, ())
-        check.finite("Floor.height", self.height)
+        check.number("Floor.height", self.height)
         self._check_motion()
 
     @property

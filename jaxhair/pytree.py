@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -58,7 +59,8 @@ def _gather_numbers(cls: type) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not field.metadata.get("static") and _is_numbers(value):
-                object.__setattr__(self, field.name, np.asarray(value, float))
+                with suppress(ValueError):  # lists of different lengths: left for the checks
+                    object.__setattr__(self, field.name, np.asarray(value, float))
         if checks is not None:
             checks(self)
 

@@ -6,6 +6,7 @@ All functions work in any floating dtype and are safe in value and derivative at
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 
@@ -111,8 +112,9 @@ def between(a: Array, b: Array) -> Array:
 
     Where b = -a any half turn will do; one about an axis perpendicular to a is taken.
     """
-    w = 1 + dot(a, b)
-    opposite = w < 1e-6
+    middle = a + b
+    w = dot(middle, middle) / 2  # 1 + a . b, without its cancellation where b is near -a
+    opposite = w < np.finfo(a.dtype).eps / 2  # nearer, rounding would choose the axis
     q = jnp.concatenate([w, cross(a, b)], axis=-2)
     half_turn = jnp.concatenate([jnp.zeros_like(w), perpendicular(a)], axis=-2)
     return unit(jnp.where(opposite, half_turn, q))

@@ -88,7 +88,7 @@ def simulate(
 
     Raises ValueError for fps that are not above 0, and NotFinite if values became NaN or infinite.
     """
-    check.shape("fps", fps, ())
+    check.number("fps", fps)
     check.positive("fps", fps)
     every = max(1, round(1 / (fps * scene.dt)))
     numbers = scene.as_arrays()
@@ -210,9 +210,11 @@ def _check_finite(recording: Recording) -> None:
     bad = int(np.argmin(finite))
     where = ""
     if isinstance(recording.observed, dict) and "positions" in recording.observed:
-        strands = np.isfinite(recording.positions[bad]).reshape(recording.scene.strands.count, -1)
-        if not strands.all():
-            where = f", strand {int(np.argmin(strands.all(axis=1)))}"
+        positions = np.asarray(recording.positions[bad])
+        strands = recording.scene.strands
+        if positions.shape == (strands.count, strands.points, 3):
+            wrong = ~np.isfinite(positions).all(axis=(1, 2))
+            where = f", strand {int(np.argmax(wrong))}" if wrong.any() else ""
     kept = Recording(
         recording.scene,
         recording.times[:bad],

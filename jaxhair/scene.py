@@ -35,15 +35,11 @@ class Phase:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name or "." in self.name:
             raise ValueError(f"phase.name is {self.name!r}; it must be a text without '.'")
-        check.shape(f"phase {self.name!r}.duration", self.duration, ())
+        check.number(f"phase {self.name!r}.duration", self.duration)
         check.positive(f"phase {self.name!r}.duration", self.duration)
         object.__setattr__(self, "duration", float(self.duration))
-        object.__setattr__(self, "effects", tuple(self.effects))
-        for effect in self.effects:
-            if not isinstance(effect, Effect):
-                raise ValueError(
-                    f"phase {self.name!r}.effects has {effect!r}; each must be an effect"
-                )
+        effects = check.several(f"phase {self.name!r}.effects", self.effects, Effect)
+        object.__setattr__(self, "effects", effects)
 
     def steps(self, dt: float) -> int:
         """Number of time steps."""
@@ -72,9 +68,14 @@ class Scene:
     dt: float = static(default=1 / 360)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "phases", tuple(self.phases))
-        object.__setattr__(self, "dt", float(self.dt))
+        check.instance("scene.strands", self.strands, Strands)
+        check.instance("scene.fibre", self.fibre, Fibre)
+        check.instance("scene.bonds", self.bonds, Bonds)
+        check.instance("scene.solver", self.solver, PositionBased)
+        object.__setattr__(self, "phases", check.several("scene.phases", self.phases, Phase))
+        check.number("scene.dt", self.dt)
         check.positive("scene.dt", self.dt)
+        object.__setattr__(self, "dt", float(self.dt))
         names = [phase.name for phase in self.phases]
         for name in names:
             if names.count(name) > 1:
@@ -121,10 +122,12 @@ class Scene:
 
     def first(self, seconds: float) -> "Scene":
         """This scene up to a simulated time [s], above 0."""
-        check.shape("seconds", seconds, ())
+        check.number("seconds", seconds)
         check.positive("seconds", seconds)
         kept: list[Phase] = []
         left = round(seconds / self.dt)
+        if left == 0:
+            raise ValueError(f"seconds is {seconds}; it must be at least a time step, {self.dt:g}")
         for phase in self.phases:
             if (steps := min(left, phase.steps(self.dt))) > 0:
                 kept.append(replace(phase, duration=steps * self.dt))
@@ -136,6 +139,8 @@ class Scene:
         for phase in self.phases:
             if phase.name == name:
                 return phase
+        if not self.phases:
+            raise ValueError(f"phase is {name!r}; the scene has no phases")
         listed = ", ".join(repr(phase.name) for phase in self.phases)
         raise ValueError(f"phase is {name!r}; it must be one of {listed}")
 

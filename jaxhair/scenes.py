@@ -42,6 +42,7 @@ def bed_hair(
 
     Phases: "lie down" (1 s), "asleep" (1 s), "get up" (1 s), "morning" (2 s).
     """
+    _check_size(strands, length)
     rng = np.random.default_rng(seed)
     head, gap = 0.09, 0.02  # radius of the head, and space below the tips at the start [m]
     outward = _cap(strands, half_angle=0.6)
@@ -90,6 +91,7 @@ def blow_dry(
 
     Phases: "press" (1 s), "blow" (3 s), "lift" (1 s), "hang" (4 s).
     """
+    _check_size(strands, length)
     rng = np.random.default_rng(seed)
     rows = 4
     x = (np.arange(strands) + 0.5) / strands * 0.24 - 0.12
@@ -147,6 +149,8 @@ def perm(
     Phases with winding: "wind" (3 s), "reduce" and "neutralise" (0.1 s each), "released". Without:
     "released, wound", "released, set", "released".
     """
+    _check_size(strands, length)
+    check.number("rod_diameter", rod_diameter)
     check.positive("rod_diameter", rod_diameter)
     rng = np.random.default_rng(seed)
     y = (np.arange(strands) - (strands - 1) / 2) * 0.002
@@ -206,6 +210,12 @@ def by_name(name: str, **options: Any) -> Scene:
     return SCENES[name](**options)
 
 
+def _check_size(strands: int, length: float) -> None:
+    check.whole("strands", strands, least=1)
+    check.number("length", length)
+    check.positive("length", length)
+
+
 def _always(contact: bool) -> tuple[Effect, ...]:
     """Gravity, air, and hair against hair if wanted."""
     return (Gravity(), Drag(0.2), *((HairContact(radius=5e-4, strength=20.0),) if contact else ()))
@@ -213,7 +223,6 @@ def _always(contact: bool) -> tuple[Effect, ...]:
 
 def _cap(count: int, half_angle: float) -> np.ndarray:
     """Unit vectors spread evenly over the lower cap of a sphere, shape (count, 3)."""
-    check.whole("strands", count, least=1)
     place = (np.arange(count) + 0.5) / count
     z = -(1 - place * (1 - np.cos(half_angle)))
     turn = GOLDEN_ANGLE * np.arange(count)

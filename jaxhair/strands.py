@@ -74,12 +74,16 @@ class Strands:
                 f"strands.positions has {points} point a strand; it must have 2 or more"
             )
         check.finite("strands.positions", self.positions)
+        dtype = jnp.asarray(self.positions).dtype
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(f"strands.positions is of dtype {dtype}; it must be a floating one")
         check.shape("strands.orientations", self.orientations, (strands, points - 1, 4))
         check.finite("strands.orientations", self.orientations)
         rows = 1 if np.shape(self.lengths)[:1] == (1,) else strands
         check.shape("strands.lengths", self.lengths, (rows, points - 1))
         if self.ragged:
             check.not_negative("strands.lengths", self.lengths)
+            self._check_missing_edges()
         else:
             check.positive("strands.lengths", self.lengths)
         if np.shape(self.natural_shape) != (strands, points - 2, 3):
@@ -100,6 +104,23 @@ class Strands:
                 raise ValueError(
                     f"strands.natural_shape has a norm of {norm}; it must be at most 1"
                 )
+
+    def _check_missing_edges(self) -> None:
+        """Edges are missing at the tip only, and never all."""
+        lengths = check.known(self.lengths)
+        if lengths is None:
+            return
+        exists = lengths > 0
+        wrong = ~exists
+        wrong[:, 1:] &= exists[:, 1:].any(axis=1, keepdims=True) & (
+            exists[:, ::-1].cumsum(axis=1)[:, ::-1][:, 1:] > 0
+        )
+        if wrong.any():
+            place = tuple(int(i) for i in np.argwhere(wrong)[0])
+            raise ValueError(
+                f"strands.lengths has the value {lengths[place]} at {place}; it must be above 0 up "
+                "to a strand's last edge"
+            )
 
     @property
     def count(self) -> int:
@@ -133,6 +154,7 @@ class Strands:
         [2, points] or two neighbouring points that coincide.
         """
         check.shape("points", points, ("strands", "points", 3))
+        check.finite("points", points)
         positions = jnp.asarray(points)
         if not jnp.issubdtype(positions.dtype, jnp.floating):
             positions = positions.astype(jnp.zeros(()).dtype)
@@ -147,7 +169,6 @@ class Strands:
                 raise ValueError(f"counts is {n!r}; each must be a whole number in [2, {size}]")
             last = jnp.asarray(np.minimum(np.arange(size), n[:, None] - 1))
             positions = jnp.take_along_axis(positions, last[..., None], axis=1)
-        check.finite("points", positions)
         x = strands_last(positions)
         edges = x[1:] - x[:-1]
         lengths = quat.safe_norm(edges)
@@ -190,6 +211,10 @@ class Strands:
         check.finite("roots", roots)
         if np.shape(directions) != (3,):
             check.shape("directions", directions, np.shape(roots))
+        check.finite("directions", directions)
+        if np.any(np.all(np.asarray(directions) == 0, axis=-1)):
+            raise ValueError(f"directions has a zero vector; none of {np.shape(directions)} may be")
+        check.number("length", length)
         check.positive("length", length)
         check.whole("points", points, least=2)
         dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
