@@ -9,7 +9,7 @@ from typing import Any
 from fitting.fit import METHODS, fit
 from fitting.measured import Measured, packaged, read
 from fitting.parameters import Constraint, Positive, Simplex
-from fitting.report import table, write
+from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
 from jaxhair import read_curves
 from jaxhair.__main__ import UNITS, length
@@ -96,12 +96,13 @@ def _state_and_path(text: str) -> tuple[str | None, str]:
 
 def _fit(options: argparse.Namespace) -> int:
     folder = Path(options.output)
-    folder.mkdir(parents=True, exist_ok=True)
     if not options.overwrite and (folder / "fit.json").exists():
         raise FileExistsError(
             f"{folder / 'fit.json'} exists: --output must be another folder, or add --overwrite"
         )
     measured = _measured(options)
+    folder.mkdir(parents=True, exist_ok=True)
+    check_outputs(folder, measured.targets, overwrite=options.overwrite)
     if not options.quiet:
         print(f"Fitting: {measured.title}. The first simulation includes compilation.")
 

@@ -22,6 +22,8 @@ CLIMB = 0.15
 BRIEF: dict[str, Any] = {"seconds": 0.25, "free": FREE}
 
 TREATMENTS = ("water set", "acid set", "perm")
+FILE_KEYS = {"title", "hair", "state"}
+HAIR_KEYS = {"natural_curl_diameter", "rod_diameter", "length", "points"}
 STATE_KEYS = {
     "name",
     "treatment",
@@ -51,7 +53,11 @@ def packaged() -> Measured:
 
 def read(path: str | Path) -> Measured:
     """The curls of a file of the same form. Raises ValueError for a wrong or missing entry."""
-    return from_text(Path(path).read_text(encoding="utf-8"), name=str(path))
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not TOML: {error}") from error
+    return from_text(text, name=str(path))
 
 
 def from_text(text: str, *, name: str) -> Measured:
@@ -64,6 +70,8 @@ def from_text(text: str, *, name: str) -> Measured:
     states = table.get("state")
     if not isinstance(hair, dict) or not isinstance(states, list) or not states:
         raise ValueError(f"{name} must have a table [hair] and one or more [[state]]")
+    _check_keys(table, FILE_KEYS, name)
+    _check_keys(hair, HAIR_KEYS, f"{name}, hair")
     rod = _number(hair, "rod_diameter", f"{name}, hair")
     length = _number(hair, "length", f"{name}, hair")
     points = hair.get("points", 25)
@@ -77,12 +85,17 @@ def from_text(text: str, *, name: str) -> Measured:
     for number, state in enumerate(states):
         where = f"{name}, state {number + 1}"
         label, made = _phases(state, rod, where)
+        if label in targets:
+            raise ValueError(f"{where}: name is {label!r} again; names must differ")
         phases += treatments.wash(name=f"{label}, wash before", **BRIEF) if number else ()
         phases += made
         diameter = 1 / _inverse_diameter(state, 1 / rod, natural, where)
         targets[label] = Helix(diameter, math.pi * diameter * math.tan(CLIMB))
     equal = Bonds((0.25, 0.25, 0.25, 0.25))
-    scene = Scene(curly(length, points, natural), bonds=equal, phases=tuple(phases))
+    try:
+        scene = Scene(curly(length, points, natural), bonds=equal, phases=tuple(phases))
+    except ValueError as error:
+        raise ValueError(f"{name}, hair: {error}") from error
     return Measured(str(table.get("title", name)), scene, targets)
 
 
@@ -100,13 +113,13 @@ def curly(length: float, points: int, inverse_diameter: float) -> Strands:
 
 def _phases(state: Any, rod: float, where: str) -> tuple[str, list[Phase]]:
     """The state's name and the phases that lead to it, on the hair as it is then."""
-    if not isinstance(state, dict) or not isinstance(state.get("name"), str):
-        raise ValueError(f"{where}: name is missing; it must be a text")
-    if unknown := set(state) - STATE_KEYS:
-        raise ValueError(
-            f"{where}: {sorted(unknown)[0]!r} is unknown; known are {sorted(STATE_KEYS)}"
-        )
-    name, treatment = state["name"], state.get("treatment")
+    if not isinstance(state, dict):
+        raise ValueError(f"{where}: it is {state!r}; it must be a table")
+    _check_keys(state, STATE_KEYS, where)
+    name, treatment = state.get("name"), state.get("treatment")
+    washed = state.get("after_wash", False)
+    if not isinstance(name, str) or not name or "." in name:
+        raise ValueError(f"{where}: name is {name!r}; it must be a text without '.'")
     if treatment not in TREATMENTS:
         raise ValueError(f"{where}: treatment is {treatment!r}; it must be one of {TREATMENTS}")
     make = {
@@ -114,7 +127,8 @@ def _phases(state: Any, rod: float, where: str) -> tuple[str, list[Phase]]:
         "acid set": treatments.acid_set,
         "perm": treatments.perm,
     }[treatment]
-    washed = bool(state.get("after_wash", False))
+    if not isinstance(washed, bool):
+        raise ValueError(f"{where}: after_wash is {washed!r}; it must be true or false")
     label = f"{name}, before" if washed else name
     phases = list(make(name=label, rod_diameter=rod, climb=CLIMB, **BRIEF))
     if washed:
@@ -131,6 +145,11 @@ def _inverse_diameter(state: dict[str, Any], rod: float, natural: float, where: 
     if value >= 1:
         raise ValueError(f"{where}: {given[0]} is {value}; it must be below 1")
     return value * rod if given[0] == "wave_efficiency" else natural + value * (rod - natural)
+
+
+def _check_keys(table: dict[str, Any], known: set[str], where: str) -> None:
+    if unknown := set(table) - known:
+        raise ValueError(f"{where}: {sorted(unknown)[0]!r} is unknown; known are {sorted(known)}")
 
 
 def _number(table: dict[str, Any], key: str, where: str) -> float:

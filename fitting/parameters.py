@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxhair import Scene, named_leaves, replace_leaves
+from jaxhair import Scene, check, named_leaves, replace_leaves
 from jaxhair.strands import BONDS
 
 
@@ -40,7 +40,7 @@ class Simplex(Constraint):
         return np.log(positive[:-1] / positive[-1])
 
     def value(self, free: Array, start: np.ndarray) -> Array:
-        return jax.nn.softmax(jnp.append(free, jnp.zeros_like(free[:1]))) * float(start.sum())
+        return jax.nn.softmax(jnp.append(free, jnp.zeros(1, free.dtype))) * float(start.sum())
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,8 @@ class Interval(Constraint):
     high: float
 
     def __post_init__(self) -> None:
+        check.number("low", self.low)
+        check.number("high", self.high)
         if not self.low < self.high:
             raise ValueError(f"high is {self.high}; it must be above low, {self.low}")
 
@@ -75,7 +77,8 @@ class Interval(Constraint):
 
     def value(self, free: Array, start: np.ndarray) -> Array:
         inside = self.low + (self.high - self.low) * jax.nn.sigmoid(free)
-        return inside.reshape(start.shape)
+        # rounding may lead past the upper bound
+        return jnp.minimum(inside, self.high).reshape(start.shape)
 
 
 @dataclass(frozen=True)

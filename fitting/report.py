@@ -2,12 +2,14 @@
 
 import json
 import platform
+from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxhair.export import check_new
 from jaxhair.files import Curves, write_curves
 from jaxhair.output import new_file
 from jaxhair.strands import BONDS
@@ -92,19 +94,19 @@ def write(fit: "Fit", folder: Path, *, overwrite: bool = False, **more: Any) -> 
     """Writes `fit.json`, the fitted strands of each state (`fitted-<state>.hair`) and `fit.png`.
 
     The folder must exist. The picture needs the extra `pictures`; without it the rest is written.
-    Returns the files. Raises FileExistsError where one exists and `overwrite` is false.
+    Returns the files. Raises what `check_outputs` raises, before anything is written.
     """
-    paths = [folder / "fit.json"]
-    with new_file(paths[0], overwrite=overwrite) as temporary:
+    check_outputs(folder, fit.simulated, overwrite=overwrite)
+    report, picture, *strands = outputs(folder, fit.simulated)
+    with new_file(report, overwrite=overwrite) as temporary:
         temporary.write_text(json.dumps(as_json(fit, **more), indent=2) + "\n", encoding="utf-8")
-    for state, points in fit.simulated.items():
-        paths.append(folder / f"fitted-{file_name(state)}.hair")
+    for path, points in zip(strands, fit.simulated.values(), strict=True):
         counts = np.full(len(points), points.shape[1])
-        write_curves(paths[-1], Curves(points, counts), overwrite=overwrite)
+        write_curves(path, Curves(points, counts), overwrite=overwrite)
+    paths = [report, *strands]
     try:
         from jaxhair import pictures
 
-        picture = folder / "fit.png"
         pictures.comparison(
             picture,
             list(fit.wanted.values()),
@@ -119,6 +121,25 @@ def write(fit: "Fit", folder: Path, *, overwrite: bool = False, **more: Any) -> 
     return paths
 
 
+def outputs(folder: Path, states: Iterable[str]) -> list[Path]:
+    """The files that `write` writes: `fit.json`, `fit.png`, and the strands of each state."""
+    strands = [folder / f"fitted-{file_name(state)}.hair" for state in states]
+    return [folder / "fit.json", folder / "fit.png", *strands]
+
+
+def check_outputs(folder: Path, states: Iterable[str], *, overwrite: bool) -> None:
+    """Raises what would keep `write` from writing all files: to be called before a long fit.
+
+    FileExistsError where a file exists and `overwrite` is false; ValueError where two states have
+    names that differ in no letter or digit.
+    """
+    paths = outputs(folder, states)
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"two states would be written to {path}; their names must differ more")
+        check_new(path, overwrite=overwrite)
+
+
 def file_name(state: str) -> str:
     """A state's name as part of a file name."""
-    return "".join(c if c.isalnum() else "-" for c in state).strip("-").replace("--", "-")
+    return "-".join("".join(c if c.isalnum() else " " for c in state).split())

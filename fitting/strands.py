@@ -62,6 +62,10 @@ def from_strands(
         raise ValueError(f"states have different numbers of strands: {sizes}; they must agree")
     total = next(iter(sizes.values()))
     used = np.unique(np.linspace(0, total - 1, min(strands, total)).round().astype(int))
+    for state, curves in observed.items():
+        for i in used:
+            if _length(curves.points[i]) == 0:  # what stands behind the last point repeats it
+                raise ValueError(f"state {state!r}: strand {i} has length 0; it must be above 0")
     first = next(iter(observed.values()))
     lengths = np.array([_length(first.points[i, : first.counts[i]]) for i in used])
     curl, climb = curl_shape(first, used)
@@ -111,7 +115,7 @@ def _treated(state: str, options: dict[str, Any], after: list[str]) -> list[Phas
 def _straight(curves: Curves, used: np.ndarray, lengths: np.ndarray, points: int) -> Strands:
     """Straight hair of the target's lengths, from its roots along its first edges."""
     roots = curves.points[used, 0]
-    toward = curves.points[used, 1] - roots
+    toward = _first_edges(curves, used)
     hair = Strands.straight(roots, toward, length=float(lengths.max()), points=points)
     edges = np.repeat(lengths[:, None] / (points - 1), points - 1, axis=1)
     along = np.linspace(0, 1, points)[:, None] * lengths[:, None, None]
@@ -126,24 +130,48 @@ def _straight(curves: Curves, used: np.ndarray, lengths: np.ndarray, points: int
 def curl_shape(curves: Curves, used: np.ndarray) -> tuple[float, float]:
     """Typical diameter [m] and climb [rad] of the strands' curls, taken as helices.
 
-    With the curvature k and the torsion t, medians along the strands, the diameter is
-    2 k / (k^2 + t^2) and the climb atan(t / k), positive for a right-handed curl.
+    From one edge, of length l, to the next a helix turns about its axis by phi. With the climb a,
+    the bend b between edges and the twist c between bends, by half angles,
+    sin(phi / 2) cos(a) = sin(b / 2) and sin(phi / 2) sin(a) = cos(b / 2) sin(c / 2), and the
+    diameter is l cos(a) / sin(phi / 2). Of l, b / l and c / l the medians along the strands are
+    taken. The climb is positive for a right-handed curl, and 0 for hair that hardly bends.
     """
-    curvatures, torsions = [], []
+    sizes, curvatures, torsions, longest = [], [], [], 0.0
     for i in used:
-        count = int(curves.counts[i])
-        x = resampled(curves.points[i : i + 1], [count], min(max(count, 3), 65))[0]
+        x = curves.points[i, : curves.counts[i]]
+        x = x[:: -(-len(x) // 65)]  # points as they are: those put between would bend less
+        x = x[np.append(True, np.any(x[1:] != x[:-1], axis=1))]
         size = np.linalg.norm(np.diff(x, axis=0), axis=1)
         t = np.diff(x, axis=0) / size[:, None]
         across = np.cross(t[:-1], t[1:])
         bend = np.arctan2(np.linalg.norm(across, axis=1), (t[:-1] * t[1:]).sum(1))
-        curvatures.append(2 * bend / (size[1:] + size[:-1]))
         b = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         twist = np.arctan2((np.cross(b[:-1], b[1:]) * t[1:-1]).sum(1), (b[:-1] * b[1:]).sum(1))
+        sizes.append(size)
+        curvatures.append(2 * bend / (size[1:] + size[:-1]))
         torsions.append(twist / size[1:-1])
-    curvature = max(float(np.median(np.concatenate(curvatures))), 1e-3)
-    torsion = float(np.median(np.concatenate([*torsions, [0.0]])))
-    return 2 * curvature / (curvature**2 + torsion**2), float(np.arctan2(torsion, curvature))
+        longest = max(longest, float(size.sum()))
+    edge, curvature = _median(sizes), max(_median(curvatures), 1e-3)
+    # Hair that turns less than a radian has no visible torsion, only its points' noise.
+    torsion = _median(torsions) if curvature * longest > 1 else 0.0
+    half_bend, half_twist = curvature * edge / 2, torsion * edge / 2
+    across_axis, along_axis = np.sin(half_bend), np.cos(half_bend) * np.sin(half_twist)
+    square = across_axis**2 + along_axis**2  # sin(phi / 2)^2
+    return float(edge * across_axis / square), float(np.arctan2(along_axis, across_axis))
+
+
+def _median(parts: list[np.ndarray]) -> float:
+    values = np.concatenate(parts)
+    return float(np.median(values)) if values.size else 0.0
+
+
+def _first_edges(curves: Curves, used: np.ndarray) -> np.ndarray:
+    """From each strand's root to its first point that is elsewhere [m], shape (strands, 3)."""
+    edges = []
+    for i in used:
+        away = curves.points[i] - curves.points[i, 0]
+        edges.append(away[np.argmax(np.any(away != 0, axis=1))])
+    return np.array(edges)
 
 
 def _length(x: np.ndarray) -> float:

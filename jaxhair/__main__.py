@@ -5,8 +5,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from jaxhair import scenes
-from jaxhair.export import check_ending, check_new, save
+from jaxhair import check, scenes
+from jaxhair.export import check_drawing, check_ending, check_new, save
 from jaxhair.recording import NotFinite, simulate
 from jaxhair.scene import Scene
 from jaxhair.solvers import SWEEPS, PositionBased
@@ -79,6 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _scene(options: argparse.Namespace) -> Scene:
+    if options.strands is not None:
+        check.whole("--strands", options.strands, least=1)
+    check.whole("--seed", options.seed, least=0)
     chosen: dict[str, Any] = {
         "strands": options.strands,
         "points": options.points,
@@ -110,6 +113,7 @@ def _scene(options: argparse.Namespace) -> Scene:
 def _simulate(options: argparse.Namespace) -> int:
     check_ending(options.output)
     check_new(options.output, overwrite=options.overwrite)
+    check_drawing(options.output, options.size)
     recording = simulate(_scene(options), fps=options.fps, progress=not options.quiet)
     if not recording.complete:
         print(f"interrupted: {len(recording.phases)} frames are kept", file=sys.stderr)

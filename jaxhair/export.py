@@ -85,6 +85,24 @@ def check_new(path: str | os.PathLike[str], *, overwrite: bool) -> None:
         pass
 
 
+def check_drawing(path: str | os.PathLike[str], size: int) -> None:
+    """Raises what drawing a square picture or movie would raise, before any work is done.
+
+    ValueError for a size [pixels] that is too small, or odd for an .mp4; ImportError without the
+    extra `pictures`.
+    """
+    ending = check_ending(path)
+    if ending not in (".png", ".gif", ".mp4"):
+        return
+    check.whole("size", size, least=16)
+    if ending == ".mp4" and size % 2:
+        raise ValueError(f"size is {size}; it must be even for an .mp4")
+    from jaxhair.figures import optional
+
+    for module in ("matplotlib", "PIL", *(("imageio_ffmpeg",) if ending == ".mp4" else ())):
+        optional(module)
+
+
 def as_arrays(recording: Recording) -> dict[str, np.ndarray]:
     """A recording as named arrays, see `save`."""
     leaves = named_leaves(recording.scene)

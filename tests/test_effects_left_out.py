@@ -183,7 +183,6 @@ PLAIN: dict[str, tuple[Any, Any]] = {
 }
 
 
-# Fails now for Sphere and Cylinder: Obstacle._carried gives zeros, which are subtracted.
 @pytest.mark.parametrize("name", PLAIN)
 def test_an_option_that_is_none_leaves_no_operation(name: str) -> None:
     """The same operations as an effect that knows no such option, and fewer than with it."""
@@ -247,8 +246,6 @@ def test_what_is_cut_leaves_remembered_shapes_untouched() -> None:
     assert after.fractions is not before.fractions
 
 
-# Fails now: bonds.changes slices every kind's fraction, and makes a rise of zeros, before it asks
-# whether an effect changes that kind. (Lowering removes them again.)
 @pytest.mark.parametrize("listed", [(), (jh.Hold(), jh.Gravity()), (jh.Cut(hydrogen=0.0),)])
 def test_nothing_is_traced_in_vain(listed: tuple) -> None:
     """Every operation that is traced is needed by the step's result."""

@@ -200,8 +200,6 @@ def test_between(dtype: str) -> None:
     assert np.all(q[:, 0] >= 0)
 
 
-# Fails now in float64 from 1e-6 to 5e-4: below 1 + a.b = 1e-6, a tilt of 1.4 mrad, `between` takes
-# the half turn of opposite vectors. With the dtype's eps in place of 1e-6 it passes.
 @DTYPES
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-5, 1e-4, 5e-4, 2e-3, 1e-2])
 def test_between_opposite_and_nearly_opposite_vectors(dtype: str, angle: float) -> None:

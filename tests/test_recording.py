@@ -183,7 +183,6 @@ def middle(state: jh.State) -> dict[str, jax.Array]:
     return {"positions": state.points.mean((0, 1))}
 
 
-# Fails now: _check_finite reshapes whatever is named "positions" to (strands, -1).
 def test_not_finite_with_other_positions() -> None:
     """Positions of a shape of the user's own do not spoil the error."""
     bad = Fails(4.5 * 9.8 * DT)
