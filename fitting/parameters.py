@@ -92,6 +92,15 @@ class Unbounded(Constraint):
         return free.reshape(start.shape)
 
 
+def labels(name: str, shape: tuple[int, ...]) -> list[str]:
+    """A name for every single number of a parameter, in the order of `numpy.ravel`."""
+    if shape == ():
+        return [name]
+    if name == "bonds.influence" and shape == (len(BONDS),):
+        return [f"{name}[{kind}]" for kind in BONDS]
+    return [f"{name}[{','.join(map(str, place))}]" for place in np.ndindex(shape)]
+
+
 class Parameters:
     """The freed numbers of a scene, packed into one vector and put back.
 
@@ -152,16 +161,7 @@ class Parameters:
 
     def labels(self) -> list[str]:
         """A name for every single number: "bonds.influence[hydrogen]", "fibre.peeling_rate"."""
-        labels = []
-        for name, start in self.start.items():
-            if start.ndim == 0:
-                labels.append(name)
-            elif name == "bonds.influence" and start.shape == (len(BONDS),):
-                labels += [f"{name}[{kind}]" for kind in BONDS]
-            else:
-                places = np.ndindex(start.shape)
-                labels += [f"{name}[{','.join(map(str, place))}]" for place in places]
-        return labels
+        return [label for name, value in self.start.items() for label in labels(name, value.shape)]
 
     def flat_values(self, free: Array) -> Array:
         """All values in one vector, in the order of `labels`."""

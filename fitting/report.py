@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fitting.parameters import labels
 from jaxhair.export import check_new
 from jaxhair.files import Curves, write_curves
 from jaxhair.output import new_file
-from jaxhair.strands import BONDS
 
 if TYPE_CHECKING:
     from fitting.fit import Fit
@@ -23,9 +23,7 @@ PACKAGES = ("jaxhair", "jax", "jaxlib", "numpy", "scipy", "optax")
 def table(fit: "Fit") -> str:
     """The values, the residuals and what is not determined, as text."""
     lines = [f"{'parameter':<34} {'value':>12}"]
-    for name, value in fit.values.items():
-        for label, number in _numbered(name, value):
-            lines.append(f"{label:<34} {number:>12.5g}")
+    lines += [f"{label:<34} {number:>12.5g}" for label, number in _numbers(fit).items()]
     lines += ["", f"{'state':<34} {'residual':>12}"]
     for state, residual in fit.residuals_mm.items():
         lines.append(f"{state:<34} {residual:>9.3f} mm")
@@ -42,21 +40,19 @@ def table(fit: "Fit") -> str:
     return "\n".join(lines)
 
 
-def _numbered(name: str, value: np.ndarray) -> list[tuple[str, float]]:
-    if value.ndim == 0:
-        return [(name, float(value))]
-    if name == "bonds.influence" and value.shape == (len(BONDS),):
-        return [(f"{name}[{kind}]", float(v)) for kind, v in zip(BONDS, value, strict=True)]
-    return [
-        (f"{name}[{','.join(map(str, place))}]", float(value[place]))
-        for place in np.ndindex(value.shape)
-    ]
+def _numbers(fit: "Fit") -> dict[str, float]:
+    """Every fitted number by its label."""
+    return {
+        label: float(number)
+        for name, value in fit.values.items()
+        for label, number in zip(labels(name, value.shape), value.ravel(), strict=True)
+    }
 
 
 def as_json(fit: "Fit", **more: Any) -> dict[str, Any]:
     """The fit as plain data, see `write`."""
     return {
-        "parameters": {name: {"value": _plain(v)} for name, v in fit.values.items()},
+        "parameters": {label: {"value": _plain(v)} for label, v in _numbers(fit).items()},
         "residual_mm": _plain(fit.residual_mm),
         "residual_mm_by_state": {name: _plain(v) for name, v in fit.residuals_mm.items()},
         "converged": fit.converged,

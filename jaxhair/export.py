@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from jaxhair import check
-from jaxhair.files import Curves, write_arrays, write_curves
+from jaxhair.arrays import write_arrays
+from jaxhair.files import Curves, write_curves
 from jaxhair.obstacles import Mesh, Obstacle
 from jaxhair.output import new_file
 from jaxhair.recording import Recording

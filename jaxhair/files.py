@@ -11,12 +11,9 @@ All are little-endian and written in float32. None of them says what its unit of
 which of its axes points up, so a reader must know: `unit` and `up` of the functions below.
 """
 
-import io
-import math
 import os
 import struct
-import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxhair.arrays import contents, numbers, unzip, zip_arrays
 from jaxhair.output import new_file
 
 Points = NDArray[Any]
@@ -39,7 +37,6 @@ _HAIR_DIAMETER = 80e-6  # [m]; a file must state one, and readers draw it
 # points, unless it is at most this many times the points of the strands.
 _PADDED_POINTS = 10_000_000
 _PADDED_RATIO = 100
-_DEFLATE_RATIO = 1032  # no deflate stream grows by more
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +55,10 @@ class Curves:
     counts: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        points = _numbers("points", self.points, "fiu")
+        points = numbers("points", self.points, "fiu")
         with np.errstate(all="ignore"):  # a value too large for float64 is reported below
             points = points.astype(np.float64)
-        counts = _numbers("counts", self.counts, "iu")
+        counts = numbers("counts", self.counts, "iu")
         if points.ndim != 3 or points.shape[-1] != 3:
             raise ValueError(
                 f"points has shape {points.shape}; it must have shape (strands, points, 3)"
@@ -90,7 +87,7 @@ class Curves:
         finite; and where a few strands are so much longer than the others that padding all to
         one length would need over a hundred times the memory.
         """
-        arrays = [_numbers(f"strand {i}", s, "fiu") for i, s in enumerate(strands)]
+        arrays = [numbers(f"strand {i}", s, "fiu") for i, s in enumerate(strands)]
         for i, array in enumerate(arrays):
             if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
                 raise ValueError(
@@ -129,7 +126,7 @@ def read_curves(
     path = Path(path)
     reader, _ = _format(path)
     _check_unit(unit, up)
-    data = _contents(path)
+    data = contents(path)
     try:
         points, counts = reader(data)
         short = counts < 2
@@ -193,56 +190,6 @@ def write_curves(
         writer(temporary, points.astype("<f4"), curves.counts, unit, up)
 
 
-def read_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
-    """Arrays of a .npz file by name.
-
-    Raises ValueError naming the file and the array where the file is no .npz file, is truncated
-    or damaged, or holds pickled objects, which are never loaded; OSError where it cannot be opened.
-    """
-    path = Path(path)
-    data = _contents(path)
-    try:
-        return _unzip(data)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def write_arrays(
-    path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, overwrite: bool = False
-) -> None:
-    """Write named arrays to a compressed .npz file, which `read_arrays` and `numpy.load` read.
-
-    Entries may be numbers, booleans or strings. The file appears when it is complete; see
-    `jaxhair.output.new_file` for what is raised where it exists or its folder does not. Raises
-    ValueError where the ending is not .npz, a name is not a string or an entry is of another type.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".npz":
-        raise ValueError(f"{path} ends in {path.suffix!r}; arrays must go to a file ending in .npz")
-    for name in arrays:
-        if not isinstance(name, str) or not name or "\0" in name:
-            raise ValueError(f"an array is named {name!r}; a name must be a string, without NUL")
-    checked = {
-        name: _numbers(f"array {name!r}", array, "biufcSU") for name, array in arrays.items()
-    }
-    with new_file(path, overwrite=overwrite) as temporary:
-        _zip(temporary, checked)
-
-
-def _numbers(name: str, value: Any, kinds: str) -> NDArray[Any]:
-    """`value` as an array whose type is of one of NumPy's `kinds`."""
-    try:
-        array = np.asarray(value)
-    except ValueError as error:  # nested sequences of different lengths
-        raise ValueError(f"{name} must be an array: {error}") from None
-    if array.dtype.kind not in kinds:
-        allowed = {"iu": "whole numbers", "fiu": "real numbers"}.get(
-            kinds, "numbers, booleans or strings"
-        )
-        raise ValueError(f"{name} has type {array.dtype}; it must be an array of {allowed}")
-    return array
-
-
 def _check_counts(counts: NDArray[Any], strands: int, *, least: int, most: int) -> None:
     if counts.shape != (strands,):
         raise ValueError(f"counts has shape {counts.shape}; it must have shape ({strands},)")
@@ -261,13 +208,6 @@ def _check_unit(unit: float, up: str) -> None:
         raise ValueError(f"unit is {unit!r}; it must be from 1e-12 to 1e12 metres")
     if up not in ("y", "z"):
         raise ValueError(f"up is {up!r}; it must be one of 'y', 'z'")
-
-
-def _contents(path: Path) -> bytes:
-    # anything but a regular file could be endless
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path} cannot be read: it must be a regular file")
-    return path.read_bytes()
 
 
 def _padded(points: Points, counts: Counts) -> Points:
@@ -386,10 +326,10 @@ def _write_data(path: Path, points: Points, counts: Counts, unit: float, up: str
 
 
 def _read_npz(data: bytes) -> tuple[Points, Counts]:
-    arrays = _unzip(data, ("positions", "counts"))
+    arrays = unzip(data, ("positions", "counts"))
     if "positions" not in arrays:
         raise ValueError("the file has no array 'positions'; strands must be in one of that name")
-    points = _numbers("positions", arrays["positions"], "fiu")
+    points = numbers("positions", arrays["positions"], "fiu")
     shape = points.shape
     # strands without points take no bytes, so their number would not be bounded by the file
     if len(shape) not in (3, 4) or shape[-1] != 3 or shape[-2] == 0 < shape[-3] or 0 in shape[:-3]:
@@ -399,80 +339,14 @@ def _read_npz(data: bytes) -> tuple[Points, Counts]:
         )
     points = points[-1] if len(shape) == 4 else points
     strands, most, _ = points.shape
-    counts = _numbers("counts", arrays.get("counts", np.full(strands, most)), "iu")
+    counts = numbers("counts", arrays.get("counts", np.full(strands, most)), "iu")
     _check_counts(counts, strands, least=0, most=most)
     counts = counts.astype(np.int64)
     return _within(points, counts), counts
 
 
 def _write_npz(path: Path, points: Points, counts: Counts, unit: float, up: str) -> None:
-    _zip(path, {"positions": points, "counts": counts.astype("<i4")})
-
-
-def _unzip(data: bytes, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Arrays of a .npz file: all, or those of `names` that it has."""
-    arrays = {}
-    # zipfile and NumPy's header parser raise a dozen types of exceptions on damaged bytes, and
-    # NumPy a warning, which may be an error here; no input or output happens that could fail.
-    try:
-        archive = zipfile.ZipFile(io.BytesIO(data))
-    except Exception as error:
-        raise ValueError(
-            f"the file is not readable ({_reason(error)}); it must be a complete .npz file"
-        ) from error
-    with archive:
-        entries = {entry.filename: entry for entry in archive.infolist()}
-        if sum(entry.compress_size for entry in archive.infolist()) > len(data):
-            raise ValueError("its entries overlap; it must be a .npz file of separate arrays")
-        for filename in entries if names is None else [f"{name}.npy" for name in names]:
-            if filename not in entries:
-                continue
-            name = filename.removesuffix(".npy")
-            try:
-                arrays[name] = _unzip_array(archive, entries[filename])
-            except Exception as error:
-                raise ValueError(
-                    f"array {name!r} is not readable ({_reason(error)}); it must be a complete "
-                    "array of numbers, booleans or strings"
-                ) from error
-    return arrays
-
-
-def _reason(error: Exception) -> str:
-    # some have no text; NumPy's goes on with advice on parameters that are not offered here
-    return str(error).partition("\n")[0] or type(error).__name__
-
-
-def _unzip_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"compression {entry.compress_type}; it must be none or deflate")
-    if entry.file_size > _DEFLATE_RATIO * entry.compress_size:
-        raise ValueError(f"{entry.compress_size} bytes cannot hold {entry.file_size}")
-    with archive.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        if version == (1, 0):
-            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-        elif version == (2, 0):
-            shape, _, dtype = np.lib.format.read_array_header_2_0(file)
-        else:
-            raise ValueError(f"version {version} of the .npy format; it must be (1, 0) or (2, 0)")
-        if dtype.hasobject:
-            raise ValueError(f"type {dtype}, which would run code")
-        size = file.tell() + dtype.itemsize * math.prod(shape)
-    # before NumPy allocates what the header asks for
-    if size != entry.file_size or min(shape, default=0) < 0:
-        raise ValueError(f"shape {shape} and type {dtype} do not fit its {entry.file_size} bytes")
-    with archive.open(entry) as file:
-        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-    return array
-
-
-def _zip(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    # numpy.savez_compressed does the same, but for arrays named like its own parameters
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, array, allow_pickle=False)
+    zip_arrays(path, {"positions": points, "counts": counts.astype("<i4")})
 
 
 _FORMATS: dict[str, tuple[Reader, Writer]] = {

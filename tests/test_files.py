@@ -8,7 +8,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxhair.files import Curves, read_arrays, read_curves, write_arrays, write_curves
+from jaxhair.arrays import read_arrays, write_arrays
+from jaxhair.files import Curves, read_curves, write_curves
 
 ENDINGS = [".hair", ".data", ".npz"]
 

@@ -113,7 +113,9 @@ def test_undetermined_directions(jacobian: list, directions: list[dict[str, floa
     assert len(found) == len(directions)
     for direction, wanted in zip(found, directions, strict=True):
         assert direction.uncertainty > 1e10
-        sign = 1 if direction.change["fibre.peeling_rate"] * wanted["fibre.peeling_rate"] > 0 else -1
+        sign = (
+            1 if direction.change["fibre.peeling_rate"] * wanted["fibre.peeling_rate"] > 0 else -1
+        )
         change = {name: sign * value for name, value in direction.change.items()}
         assert change == pytest.approx(wanted)
 

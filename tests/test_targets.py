@@ -65,7 +65,9 @@ def test_slope_of_the_squares_is_exact(size: float) -> None:
     x, direction = curl() + rng.normal(0, size, curl().shape), rng.normal(0, 1, curl().shape)
 
     def squares(step: float) -> jax.Array:
-        return jnp.sum(aligned_residuals(jnp.asarray(x) + step * direction, jnp.asarray(curl())) ** 2)
+        return jnp.sum(
+            aligned_residuals(jnp.asarray(x) + step * direction, jnp.asarray(curl())) ** 2
+        )
 
     h = 1e-6
     central = (squares(h) - squares(-h)) / (2 * h)
