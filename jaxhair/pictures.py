@@ -7,7 +7,9 @@ is lit after Kajiya and Kay (shading.py). Needs the extra `pictures`.
 
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -123,11 +125,28 @@ def _write_mp4(path: Path, scene: "_Scene", fps: float, progress: Progress) -> N
         str(path), scene.stage.camera.size, fps=fps, quality=8, macro_block_size=2
     )
     try:
-        writer.send(None)
+        with _no_fork():
+            writer.send(None)
         for index in progress(range(scene.count)):
             writer.send(np.ascontiguousarray(scene.image(index)))
     finally:
         writer.close()
+
+
+@contextmanager
+def _no_fork() -> Iterator[None]:
+    """Lets imageio-ffmpeg start its program without running Python in a forked process, which can
+    hang beside JAX's threads; Ctrl-C then reaches that program too."""
+    name = "IMAGEIO_FFMPEG_NO_PREVENT_SIGINT"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
 
 
 def _write_gif(path: Path, scene: "_Scene", fps: float, progress: Progress) -> None:
