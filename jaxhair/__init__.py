@@ -3,8 +3,9 @@
 from jaxhair import scenes, treatments
 from jaxhair.bonds import Bonds, Cut, Reform
 from jaxhair.contact import HairContact
+from jaxhair.direct import Direct
 from jaxhair.export import save
-from jaxhair.fibre import Fibre, Soften
+from jaxhair.fibre import Fibre, PhysicalFibre, Soften
 from jaxhair.files import Curves, read_curves, write_curves
 from jaxhair.forces import Drag, DryingWind, Gravity, Wind
 from jaxhair.holding import Hold, Unloaded, Wound
@@ -13,15 +14,17 @@ from jaxhair.pytree import pytree
 from jaxhair.recording import NotFinite, Recording, simulate
 from jaxhair.scene import Phase, Scene, named_leaves, replace_leaves
 from jaxhair.simulate import run
-from jaxhair.solvers import PositionBased
+from jaxhair.solvers import Compliant, PositionBased
 from jaxhair.strands import BONDS, State, Strands
 
 __all__ = [
     "BONDS",
     "Bonds",
+    "Compliant",
     "Curves",
     "Cut",
     "Cylinder",
+    "Direct",
     "Drag",
     "DryingWind",
     "Fibre",
@@ -31,6 +34,7 @@ __all__ = [
     "Hold",
     "NotFinite",
     "Phase",
+    "PhysicalFibre",
     "PositionBased",
     "Recording",
     "Reform",

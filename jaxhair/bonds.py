@@ -1,6 +1,7 @@
 """Side-chain bonds: the rest shape they make, what they remember, how they break and re-form."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -70,6 +71,24 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
     return jnp.sum(share[:, :, None] * held, axis=1)
 
 
+def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, Array]:
+    """(Eq. 15) as one spring: Omega - Omega_o = share (Omega - shape).
+
+    shape = sum_j f_j b_j Omega_j / sum_j f_j b_j, free of stress, and
+    share = sum_j f_j b_j / sum_j f_j, the part of the whole stiffness that is bonded. Where all
+    bonds are cut the share is 0 and the shape straight.
+
+    Arguments: as in `rest_shape`.
+    Returns shape as unit quaternions, shape (inner points, 4, strands), and share, shape (inner
+    points, 1, strands).
+    """
+    bonded = influence * fractions
+    whole = jnp.sum(bonded, axis=1, keepdims=True)
+    cut = whole == 0
+    shape = jnp.sum(bonded[:, :, None] * shapes, axis=1) / jnp.where(cut, 1, whole)
+    return quat.from_vector_part(shape), whole / jnp.sum(influence, axis=1, keepdims=True)
+
+
 def present_shape(r: Array, remembered: Array) -> Array:
     """Omega, the vector part of r or of -r, whichever is nearer to a remembered shape.
 
@@ -135,7 +154,7 @@ def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
         new = remembered(shapes[:, j], fractions[:, j], rise, r)
         shapes = shapes.at[:, j].set(new)
         fractions = fractions.at[:, j].add(rise)
-    return State(state.positions, state.velocities, state.orientations, shapes, fractions)
+    return replace(state, shapes=shapes, fractions=fractions)
 
 
 class _Toward(BondEffect):

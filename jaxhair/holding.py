@@ -7,6 +7,7 @@ from jax import Array, lax
 
 from jaxhair import check
 from jaxhair import quaternion as quat
+from jaxhair.bonds import springs
 from jaxhair.effects import HoldingEffect, PoseEffect
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
@@ -127,15 +128,12 @@ class Unloaded(PoseEffect):
 
         Where all bonds are cut the present shape stays.
         """
-        weights = (rod.influence * state.fractions)[:, :, None]
-        whole = jnp.sum(weights, axis=1)
-        cut = whole == 0
-        free = jnp.sum(weights * state.shapes, axis=1) / jnp.where(cut, 1, whole)
+        free, share = springs(state.shapes, state.fractions, rod.influence)
         q = state.orientations
         present = quat.relative(q[:-1], q[1:])
-        square = jnp.minimum(quat.dot(free, free), 0.999)
-        turn = jnp.concatenate([jnp.sqrt(1 - square), free], axis=1)
-        return _from_root(rod, state, jnp.where(cut, present, turn))
+        square = jnp.minimum(quat.dot(free[:, 1:], free[:, 1:]), 0.999)
+        turn = jnp.concatenate([jnp.sqrt(1 - square), free[:, 1:]], axis=1)
+        return _from_root(rod, state, jnp.where(share == 0, present, turn))
 
 
 def _from_root(rod: Rod, state: State, turn: Array) -> tuple[Array, Array]:

@@ -94,6 +94,17 @@ def tangent(q: Array) -> Array:
     )
 
 
+def axes(q: Array) -> tuple[Array, Array, Array]:
+    """R(q) e1, R(q) e2 and R(q) e3, the columns of the rotation matrix of a unit quaternion."""
+    w, x, y, z = (q[..., i, :] for i in range(4))
+    columns = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+    ]
+    d1, d2 = (jnp.stack(column, axis=-2) for column in columns)
+    return d1, d2, tangent(q)
+
+
 def rotate(q: Array, v: Array) -> Array:
     """R(q) v for a unit quaternion."""
     axis = q[..., 1:, :]

@@ -5,6 +5,8 @@ After Kugelstadt and Schoemer, Position and Orientation Based Cosserat Rods, 201
 weights have size 1 there.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -13,17 +15,36 @@ from jaxhair.pytree import pytree, static
 
 
 @pytree
+class Material:
+    """What a rod of a physical fibre is made of; each of shape (1, 1, strands or 1).
+
+    Arguments:
+        unit_length: mean rest length of the edges [m], by which solvers make numbers without units.
+        linear_density: [kg/m]. axial_stiffness: E A [N].
+        damping_time: of the material's own damping [s]; None where it has none.
+    """
+
+    unit_length: Array
+    linear_density: Array
+    axial_stiffness: Array
+    damping_time: Any = None
+
+
+@pytree
 class Rod:
     """What stays the same of all strands during a phase.
 
     Arguments:
         lengths: rest lengths of the edges [m], shape (points - 1, 1, strands or 1).
-        point_weights: inverse masses, relative to a free point's: 1, and 0 where a point is held
-            or missing; shape (points, 1, strands or 1).
+        point_weights: inverse masses, shape (points, 1, strands or 1); 0 where a point is held or
+            missing. Relative: 1 for the paper's fibre; for a physical one, the mass of an edge of
+            mean length over the point's own.
         edge_weights: 1 where an edge may turn, 0 where it is held or missing; shape
             (points - 1, 1, strands or 1).
-        stiffness: k at the inner points, shape (points - 2, 1, strands or 1).
+        stiffness: at the inner points: k, shape (points - 2, 1, strands or 1), or with a material
+            the stiffness about d1, d2 and d3 [N m^2], shape (points - 2, 3, strands or 1).
         influence: f_j, shape (inner points or 1, 4, strands or 1).
+        material: of a physical fibre; None for the paper's.
         ragged: some strands have fewer points; their missing edges have rest length 0.
     """
 
@@ -32,6 +53,7 @@ class Rod:
     edge_weights: Array
     stiffness: Array
     influence: Array
+    material: Material | None = None
     ragged: bool = static(default=False)
 
     def edge_exists(self) -> Array:
@@ -46,6 +68,23 @@ class Rod:
     def distance(self) -> Array:
         """Arc length from the root to each inner point [m], shape (points - 2, 1, ...)."""
         return jnp.cumsum(self.lengths, axis=0)[:-1]
+
+    def point_lengths(self) -> Array:
+        """Length of rod that belongs to each point [m]: half of each edge beside it."""
+        none = jnp.zeros_like(self.lengths[:1])
+        return (jnp.concatenate([none, self.lengths]) + jnp.concatenate([self.lengths, none])) / 2
+
+    def bending(self) -> Array:
+        """Spring constants 4 B / h of |Omega - Omega_o|^2 / 2 [J], shape (points - 2, 3, ...).
+
+        Omega is half the sine of the angle, and h the length of rod that the point stands for, so
+        that this is a rod's (B / h) theta^2 / 2. Needs a material.
+        """
+        h = self.point_lengths()[1:-1]
+        if not self.ragged:
+            return 4 * self.stiffness / h
+        exists = self.edge_exists()[1:]
+        return jnp.where(exists, 4 * self.stiffness / jnp.where(exists, h, 1), 0)
 
     def tangents(self, positions: Array) -> Array:
         """Unit vector of the edge that starts at each point; the tip has its last edge's.
@@ -67,7 +106,9 @@ def _share(part: Array, whole: Array) -> Array:
     return jnp.where(none, 0, part / jnp.where(none, 1, whole))
 
 
-def stretch_shear_factors(w1: Array, w2: Array, wq: Array, length: Array) -> tuple[Array, ...]:
+def stretch_shear_factors(
+    w1: Array, w2: Array, wq: Array, length: Array, compliance: Array | float = 0.0
+) -> tuple[Array, ...]:
     """The factors of gamma in the corrections of p1 (Eq. 2), p2 (Eq. 3) and q (Eq. 4).
 
     w1 l / D, w2 l / D and 2 wq l^2 / D with D = w1 + w2 + 4 wq l^2. The 2 of the last is missing
@@ -77,8 +118,9 @@ def stretch_shear_factors(w1: Array, w2: Array, wq: Array, length: Array) -> tup
     Arguments:
         w1, w2: inverse masses of the two points. wq: of the edge's frame [1/m^2].
         length: l [m].
+        compliance: of a constraint that gives way, added to D.
     """
-    whole = w1 + w2 + 4 * wq * length**2
+    whole = w1 + w2 + 4 * wq * length**2 + compliance
     return (
         _share(w1 * length, whole),
         _share(w2 * length, whole),
@@ -100,8 +142,15 @@ def stretch_shear(
         p1, p2: ends of an edge [m], shape (..., 3, strands). q: its frame, (..., 4, strands).
         length: l [m]. factors: of `stretch_shear_factors`.
     """
-    g1, g2, gq = factors
     gamma = stretch_shear_violation(p1, p2, q, length)
+    return stretch_shear_moved(p1, p2, q, gamma, factors)
+
+
+def stretch_shear_moved(
+    p1: Array, p2: Array, q: Array, gamma: Array, factors: tuple[Array, ...]
+) -> tuple[Array, Array, Array]:
+    """The corrections of `stretch_shear` for a given gamma."""
+    g1, g2, gq = factors
     w, x, y, z = (q[..., i, :] for i in range(4))
     q_conj_e = jnp.stack([z, -y, x, -w], axis=-2)
     turn = quat.vector_multiply(gq * gamma, q_conj_e)
@@ -147,8 +196,15 @@ def bend_twist(
         rest: the unit quaternion whose vector part is Omega_o, shape (..., 4, strands).
         factors: of `bend_twist_factors`.
     """
-    h1, h2 = factors
     c = bend_twist_violation(darboux(q1, q2), rest)
+    return bend_twist_moved(q1, q2, c, factors)
+
+
+def bend_twist_moved(
+    q1: Array, q2: Array, c: Array, factors: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The corrections of `bend_twist` for a given violation."""
+    h1, h2 = factors
     new1 = quat.unit(q1 + quat.multiply_vector(q2, h1 * c))
     new2 = quat.unit(q2 - quat.multiply_vector(q1, h2 * c))
     return new1, new2

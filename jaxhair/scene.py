@@ -11,10 +11,10 @@ import numpy as np
 from jaxhair import check
 from jaxhair.bonds import Bonds
 from jaxhair.effects import Effect, of_kind
-from jaxhair.fibre import Fibre
+from jaxhair.fibre import Fibre, PhysicalFibre
 from jaxhair.holding import Wound
 from jaxhair.pytree import pytree, static
-from jaxhair.solvers import PositionBased
+from jaxhair.solvers import PositionBased, Solver
 from jaxhair.strands import Strands
 
 
@@ -51,9 +51,11 @@ class Scene:
     """All that a simulation needs.
 
     Arguments:
-        strands: the hair as it starts. fibre: its stiffness. bonds: their influence.
+        strands: the hair as it starts. bonds: their influence.
+        fibre: its stiffness. None, which stands for the fibre of the solver's kind: a `Fibre` for
+            `PositionBased`, a `PhysicalFibre` for the compliant solvers.
         phases: what happens, in order; names must differ.
-        solver: of the strands' elasticity.
+        solver: of the strands' elasticity. `Compliant` and `Direct` need a `PhysicalFibre`.
         dt: time step [s].
 
     Every number is a leaf of the pytree, to be traced, differentiated and fitted; counts and
@@ -61,17 +63,26 @@ class Scene:
     """
 
     strands: Strands
-    fibre: Fibre = Fibre()
+    fibre: Any = None
     bonds: Bonds = Bonds()
     phases: tuple[Phase, ...] = ()
-    solver: PositionBased = PositionBased()
+    solver: Solver = PositionBased()
     dt: float = static(default=1 / 360)
 
     def __post_init__(self) -> None:
         check.instance("scene.strands", self.strands, Strands)
-        check.instance("scene.fibre", self.fibre, Fibre)
         check.instance("scene.bonds", self.bonds, Bonds)
-        check.instance("scene.solver", self.solver, PositionBased)
+        check.instance("scene.solver", self.solver, Solver)
+        if self.fibre is None:
+            fitting = PhysicalFibre() if self.solver.compliant else Fibre()
+            object.__setattr__(self, "fibre", fitting)
+        if self.solver.compliant and isinstance(self.fibre, Fibre):
+            raise ValueError(
+                f"scene.fibre is a Fibre, whose k has no unit; with {type(self.solver).__name__} "
+                "it must be a PhysicalFibre"
+            )
+        if not isinstance(self.fibre, PhysicalFibre):
+            check.instance("scene.fibre", self.fibre, Fibre)
         object.__setattr__(self, "phases", check.several("scene.phases", self.phases, Phase))
         check.number("scene.dt", self.dt)
         check.positive("scene.dt", self.dt)
@@ -90,9 +101,9 @@ class Scene:
             if len(np.shape(value)) > 1:
                 allowed = (strands, 4) if len(np.shape(value)) == 2 else (strands, inner, 4)
                 check.shape(f"bonds.{name}", value, allowed)
-        for name in ("stiffness", "cuticle_share", "peeling_rate"):
-            if np.shape(getattr(self.fibre, name)) not in ((), (1,), (strands,)):
-                check.shape(f"fibre.{name}", getattr(self.fibre, name), (strands,))
+        for name, value in vars(self.fibre).items():
+            if value is not None and np.shape(value) not in ((), (1,), (strands,)):
+                check.shape(f"fibre.{name}", value, (strands,))
 
     def _check_rods(self) -> None:
         longest = check.known(self.strands.lengths)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +21,12 @@ from jaxhair.effects import (
     VelocityEffect,
     of_kind,
 )
-from jaxhair.fibre import stiffness
+from jaxhair.fibre import PhysicalFibre, material, stiffness
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
 from jaxhair.scene import Scene
-from jaxhair.solvers import PositionBased
+from jaxhair.solvers import Solver
 from jaxhair.strands import State, strands_last
 
 
@@ -35,7 +36,7 @@ class Setup:
 
     rod: Rod
     effects: tuple[Effect, ...]
-    solver: PositionBased
+    solver: Solver
     dt: float = static()
 
 
@@ -48,34 +49,60 @@ def step(setup: Setup, state: State, time: Array) -> State:
         time: of the step's start, within the phase [s], shape ().
     """
     rod, effects, dt = setup.rod, setup.effects, setup.dt
-    p, q, v = state.positions, state.orientations, state.velocities
     # 1. External forces, and the bonds that break. 2a. Interactions that change velocities.
     fractions, rises = bond.changes(of_kind(effects, BondEffect), rod, state, dt)
-    for force in of_kind(effects, VelocityEffect):
-        v = v + force.velocity_change(rod, state, dt)
-
+    change = [e.velocity_change(rod, state, dt) for e in of_kind(effects, VelocityEffect)]
+    state = replace(state, fractions=fractions)
     if of_kind(effects, PoseEffect):
-        for pose in of_kind(effects, PoseEffect):
-            p, q = pose.pose(rod, replace(state, fractions=fractions))
-        v = jnp.zeros_like(v)
+        state = posed(setup, state)
+    elif setup.solver.substeps == 1:
+        state = moved(setup, state, change, time, dt)
     else:
-        # 2b. Prediction; held points move; obstacles.
-        p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
-        for holding in of_kind(effects, HoldingEffect):
-            p, q = holding.moved(rod, p, q, time, dt)
-        for obstacle in of_kind(effects, PositionEffect):
-            p = obstacle.projected(rod, p, state.positions, time, dt)
-        # 3. The rest shape that the bonds make.
-        r = rods.darboux(q[:-1], q[1:])
-        rest = bond.rest_shape(state.shapes, fractions, rod.influence, r)
-        # 4. Elasticity, and the velocity that follows from it.
-        p, q = setup.solver.solve(rod, p, q, from_vector_part(rest))
-        v = (p - state.positions) / dt
-    state = State(p, v, q, state.shapes, fractions)
+        n = setup.solver.substeps
+        for_each = [dv / n for dv in change]
+
+        def substep(state: State, number: Array) -> tuple[State, None]:
+            return moved(setup, state, for_each, time + number * (dt / n), dt / n), None
+
+        state, _ = lax.scan(substep, state, jnp.arange(n, dtype=state.positions.dtype))
     # 5. The bonds that re-form remember the present shape.
     if rises:
+        q = state.orientations
         state = bond.reformed(state, rises, rods.darboux(q[:-1], q[1:]))
     return state
+
+
+def moved(
+    setup: Setup, state: State, velocity_changes: list[Array], time: Array, dt: float
+) -> State:
+    """The strands' motion in a step or a substep of it, under the changes of velocity given."""
+    rod, effects, solver = setup.rod, setup.effects, setup.solver
+    p, q, v = state.positions, state.orientations, sum(velocity_changes, state.velocities)
+    # 2b. Prediction; held points move; obstacles.
+    p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
+    for holding in of_kind(effects, HoldingEffect):
+        p, q = holding.moved(rod, p, q, time, dt)
+    for obstacle in of_kind(effects, PositionEffect):
+        p = obstacle.projected(rod, p, state.positions, time, dt)
+    # 3. The rest shape that the bonds make.
+    rest: Any
+    if solver.compliant:
+        rest = bond.springs(state.shapes, state.fractions, rod.influence)
+    else:
+        r = rods.darboux(q[:-1], q[1:])
+        rest = from_vector_part(bond.rest_shape(state.shapes, state.fractions, rod.influence, r))
+    # 4. Elasticity, and the velocity that follows from it.
+    p, q, forces = solver.solve(rod, state, p, q, rest, dt)
+    return State(p, (p - state.positions) / dt, q, state.shapes, state.fractions, forces)
+
+
+def posed(setup: Setup, state: State) -> State:
+    """The state at rest in the pose that effects prescribe."""
+    p, q = state.positions, state.orientations
+    for pose in of_kind(setup.effects, PoseEffect):
+        p, q = pose.pose(setup.rod, state)
+    still = jax.tree.map(jnp.zeros_like, (state.velocities, state.forces))
+    return State(p, still[0], q, state.shapes, state.fractions, still[1])
 
 
 def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
@@ -99,14 +126,19 @@ def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
         edges_free = edges_free & ~holding.held_edges(rod)
     k = stiffness(scene.fibre, rod.distance())
     for soft in of_kind(effects, StiffnessEffect):
-        k = jnp.clip(soft.scaled(k), 0, 1)
-    rod = Rod(
-        lengths=lengths,
-        point_weights=points_free.astype(lengths.dtype),
+        k = soft.scaled(k)
+    weights = points_free.astype(lengths.dtype)
+    of_fibre = None
+    if isinstance(scene.fibre, PhysicalFibre):
+        of_fibre = material(scene.fibre, lengths)
+        own = jnp.where(points_free, rod.point_lengths(), 1)
+        weights = weights * of_fibre.unit_length / own
+    rod = replace(
+        rod,
+        point_weights=weights,
         edge_weights=edges_free.astype(lengths.dtype),
         stiffness=k,
-        influence=rod.influence,
-        ragged=strands.ragged,
+        material=of_fibre,
     )
     return Setup(rod, effects, scene.solver, scene.dt)
 
@@ -123,6 +155,7 @@ def start(scene: Scene) -> State:
         strands_last(scene.strands.orientations),
         shapes,
         jnp.broadcast_to(fractions, (shape.shape[0], 4, shape.shape[2])),
+        jnp.zeros_like(positions[1:]) if scene.solver.keeps_forces else None,
     )
 
 

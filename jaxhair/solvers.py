@@ -1,7 +1,12 @@
-"""Solvers of a strand's elasticity: from predicted positions to admissible ones."""
+"""Solvers of a strand's elasticity: from predicted positions to admissible ones.
 
+Three, of one interface (`Solver`): the paper's position-based one, compliant constraints (XPBD),
+and the direct solver of `jaxhair.direct`, which is the default choice for a physical fibre.
+"""
+
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +15,39 @@ from jax import Array, lax
 from jaxhair import check, rods
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
+from jaxhair.strands import State
 
 SWEEPS = ("red-black", "sequential")
+
+
+class Solver:
+    """What the step asks of a solver.
+
+    compliant: it takes bonds as springs, `jaxhair.bonds.springs`, and needs a physical fibre;
+        otherwise it takes the rest shape of (Eq. 15) and works with both kinds of fibre.
+    keeps_forces: the forces in the edges are part of the state.
+    substeps: how often in a time step the strands are predicted and solved, each time over
+        dt / substeps; external forces, contact and bonds are computed once a step.
+    """
+
+    compliant: ClassVar[bool]
+    keeps_forces: ClassVar[bool] = False
+    substeps: int
+
+    @abstractmethod
+    def solve(
+        self, rod: Rod, state: State, positions: Array, orientations: Array, rest: Any, dt: float
+    ) -> tuple[Array, Array, Array | None]:
+        """Positions, orientations and, if they are kept, forces at the end of a step.
+
+        Arguments:
+            state: at the start of the step.
+            positions: predicted [m], shape (points, 3, strands); held points are where they go.
+            orientations: of the start, shape (points - 1, 4, strands); held edges moved too.
+            rest: unit quaternions with vector part Omega_o, shape (points - 2, 4, strands); for a
+                compliant solver the pair that `jaxhair.bonds.springs` gives.
+            dt: of the step, or of a substep [s].
+        """
 
 
 def stiffness_per_iteration(stiffness: Array, iterations: int) -> Array:
@@ -29,8 +65,37 @@ def stiffness_per_iteration(stiffness: Array, iterations: int) -> Array:
 
 
 @pytree
-class PositionBased:
+class _Sweeping(Solver):
+    """Gauss-Seidel: constraints are projected one after another, several times over."""
+
+    iterations: int = static(default=5)
+    sweep: str = static(default="red-black")
+    orientation_weight: Any = 0.03
+    substeps: int = static(default=1)
+
+    def __post_init__(self) -> None:
+        check.whole("solver.iterations", self.iterations, least=1)
+        check.choice("solver.sweep", self.sweep, SWEEPS)
+        check.positive("solver.orientation_weight", self.orientation_weight)
+        check.whole("solver.substeps", self.substeps, least=1)
+
+    def _swept(self, *arguments: Any) -> tuple[Array, Array]:
+        sweep = _red_black if self.sweep == "red-black" else _sequential
+        return sweep(self.iterations, *arguments)
+
+    def _weights(self, rod: Rod) -> tuple[Array, Array]:
+        """Lengths without zeros, and w_q of the edges' frames."""
+        length = jnp.where(rod.edge_exists(), rod.lengths, 1) if rod.ragged else rod.lengths
+        return length, rod.edge_weights * self.orientation_weight / length**2
+
+
+@pytree
+class PositionBased(_Sweeping):
     """The paper's solver: Gauss-Seidel projections of stretch-shear, then of bend-twist.
+
+    With a physical fibre, k is the share of a violation that one compliant projection of its
+    constraint takes away, k (w1 + w2) / (k (w1 + w2) + h / (4 B dt^2)): right where a joint bends
+    by itself, and only roughly right in a strand.
 
     Arguments:
         iterations: of both, n.
@@ -38,40 +103,98 @@ class PositionBased:
             strand; "sequential" goes from root to tip as published.
         orientation_weight: w_q l^2 / w, without unit. It says how readily an edge's frame gives
             way to its points: large, and frames follow points; small, and points follow frames.
+        substeps: see `Solver`.
     """
 
-    iterations: int = static(default=5)
-    sweep: str = static(default="red-black")
-    orientation_weight: Any = 0.03
-
-    def __post_init__(self) -> None:
-        check.whole("solver.iterations", self.iterations, least=1)
-        check.choice("solver.sweep", self.sweep, SWEEPS)
-        check.positive("solver.orientation_weight", self.orientation_weight)
+    compliant: ClassVar[bool] = False
 
     def solve(
-        self, rod: Rod, positions: Array, orientations: Array, rest: Array
-    ) -> tuple[Array, Array]:
-        """Positions and orientations after n iterations.
-
-        Arguments:
-            positions: predicted [m], shape (points, 3, strands).
-            orientations: shape (points - 1, 4, strands).
-            rest: unit quaternions with vector part Omega_o, shape (points - 2, 4, strands).
-        """
-        w, free, length = rod.point_weights, rod.edge_weights, rod.lengths
-        k = stiffness_per_iteration(rod.stiffness, self.iterations)
-        if rod.ragged:
-            length = jnp.where(rod.edge_exists(), length, 1)
-            exists = rod.edge_exists().astype(length.dtype)
-            k = k * exists[1:]
-        wq = free * self.orientation_weight / length**2
+        self, rod: Rod, state: State, positions: Array, orientations: Array, rest: Any, dt: float
+    ) -> tuple[Array, Array, None]:
+        """Positions and orientations after n iterations; see `Solver.solve`."""
+        w = rod.point_weights
+        length, wq = self._weights(rod)
+        k = rod.stiffness
+        if rod.material is not None:
+            spring = _relative_springs(rod, dt) * (wq[:-1] + wq[1:])
+            k = spring / (1 + spring)
+        k = stiffness_per_iteration(k, self.iterations)
         stretch = rods.stretch_shear_factors(w[:-1], w[1:], wq, length)
         if rod.ragged:
+            exists = rod.edge_exists().astype(length.dtype)
             stretch = tuple(g * exists for g in stretch)
+            k = k * exists[1:]
         bend = rods.bend_twist_factors(wq[:-1], wq[1:], k)
-        sweep = _red_black if self.sweep == "red-black" else _sequential
-        return sweep(self.iterations, positions, orientations, length, stretch, rest, bend)
+
+        def edge(p1: Array, p2: Array, q: Array, none: None, at: Any) -> Any:
+            return *rods.stretch_shear(p1, p2, q, *at), none
+
+        def inner(q1: Array, q2: Array, none: None, at: Any) -> Any:
+            return *rods.bend_twist(q1, q2, *at), none
+
+        constants = (length, stretch), (rest, bend)
+        return *self._swept(edge, inner, positions, orientations, (None, None), constants), None
+
+
+@pytree
+class Compliant(_Sweeping):
+    """XPBD: the same projections of compliant constraints, with a physical fibre.
+
+    Each constraint has a multiplier, which grows to its force over the iterations
+    (Macklin, Mueller and Chentanez, XPBD, 2016; DOI 10.1145/2994258.2994272):
+    d lambda = -(C + alpha lambda) / (sum w |grad C|^2 + alpha), alpha = compliance / dt^2.
+    Converged, its result does not depend on iterations; it converges as slowly as the paper's.
+
+    Arguments: those of `PositionBased`.
+    """
+
+    compliant: ClassVar[bool] = True
+
+    def solve(
+        self, rod: Rod, state: State, positions: Array, orientations: Array, rest: Any, dt: float
+    ) -> tuple[Array, Array, None]:
+        """Positions and orientations after n iterations; see `Solver.solve`."""
+        w = rod.point_weights
+        length, wq = self._weights(rod)
+        shape, share = rest
+        spring = share * _relative_springs(rod, dt)
+        # alpha of stretch and shear, 1 / (E A l) in the units of the weights
+        assert rod.material is not None
+        unit_mass = rod.material.linear_density * rod.material.unit_length
+        alpha = unit_mass / (rod.material.axial_stiffness * length * dt**2)
+        stretch = rods.stretch_shear_factors(w[:-1], w[1:], wq, length, alpha * length**2)
+        whole = w[:-1] + w[1:] + length**2 * (4 * wq + alpha)
+        if rod.ragged:
+            stretch = tuple(g * rod.edge_exists().astype(length.dtype) for g in stretch)
+
+        def edge(p1: Array, p2: Array, q: Array, multiplier: Array, at: Any) -> Any:
+            length, stretch, alpha, whole = at
+            gamma = rods.stretch_shear_violation(p1, p2, q, length) + alpha * multiplier
+            moved = rods.stretch_shear_moved(p1, p2, q, gamma, stretch)
+            return *moved, multiplier - gamma * length**2 / whole
+
+        def inner(q1: Array, q2: Array, multiplier: Array, at: Any) -> Any:
+            rest, w1, w2, spring = at
+            c = rods.bend_twist_violation(rods.darboux(q1, q2), rest)
+            change = (spring * c + multiplier) / (1 + spring * (w1 + w2))
+            return *rods.bend_twist_moved(q1, q2, change, (w1, w2)), multiplier - change
+
+        like = positions[1:], shape[:, 1:]
+        multipliers = tuple(jnp.zeros_like(x) for x in like)
+        constants = (length, stretch, alpha, whole), (shape, wq[:-1], wq[1:], spring)
+        return *self._swept(edge, inner, positions, orientations, multipliers, constants), None
+
+
+def _relative_springs(rod: Rod, dt: float) -> Array:
+    """4 B dt^2 / (h m) with the mass m of an edge of mean length: (points - 2, 3, ...) [m^2]."""
+    assert rod.material is not None
+    mass = rod.material.linear_density * rod.material.unit_length
+    return rod.bending() * dt**2 / mass
+
+
+# Sweeps. `edge` and `inner` project a constraint: they take the two things it joins (and the
+# frame between two points), its multiplier or None, and its constants, and return what they took,
+# moved. `m` are the multipliers of edges and of inner points, `at` their constants.
 
 
 def _repeat(iteration: Callable[[Any], Any], x: Any, times: int) -> Any:
@@ -81,50 +204,52 @@ def _repeat(iteration: Callable[[Any], Any], x: Any, times: int) -> Any:
 
 
 def _sequential(
-    iterations: int, p: Array, q: Array, length: Array, stretch: Any, rest: Array, bend: Any
+    iterations: int, edge: Any, inner: Any, p: Array, q: Array, m: Any, at: Any
 ) -> tuple[Array, Array]:
     """Edges from root to tip, then inner points from root to tip."""
 
-    def edge(p1: Array, at: Any) -> tuple[Array, Any]:
-        p2, q, length, factors = at
-        p1, p2, q = rods.stretch_shear(p1, p2, q, length, factors)
-        return p2, (p1, q)
+    def next_edge(p1: Array, here: Any) -> tuple[Array, Any]:
+        p2, q, m, at = here
+        p1, p2, q, m = edge(p1, p2, q, m, at)
+        return p2, (p1, q, m)
 
-    def inner(q1: Array, at: Any) -> tuple[Array, Array]:
-        q2, rest, factors = at
-        q1, q2 = rods.bend_twist(q1, q2, rest, factors)
-        return q2, q1
+    def next_inner(q1: Array, here: Any) -> tuple[Array, Any]:
+        q2, m, at = here
+        q1, q2, m = inner(q1, q2, m, at)
+        return q2, (q1, m)
 
     def iteration(x: Any) -> Any:
-        p, q = x
-        tip, (p, q) = lax.scan(edge, p[0], (p[1:], q, length, stretch))
-        last, head = lax.scan(inner, q[0], (q[1:], rest, bend))
-        return jnp.concatenate([p, tip[None]]), jnp.concatenate([head, last[None]])
+        p, q, (of_edges, of_inner) = x
+        tip, (p, q, of_edges) = lax.scan(next_edge, p[0], (p[1:], q, of_edges, at[0]))
+        last, (head, of_inner) = lax.scan(next_inner, q[0], (q[1:], of_inner, at[1]))
+        p, q = jnp.concatenate([p, tip[None]]), jnp.concatenate([head, last[None]])
+        return p, q, (of_edges, of_inner)
 
-    return _repeat(iteration, (p, q), iterations)
+    return _repeat(iteration, (p, q, m), iterations)[:2]
 
 
 def _red_black(
-    iterations: int, p: Array, q: Array, length: Array, stretch: Any, rest: Array, bend: Any
+    iterations: int, edge: Any, inner: Any, p: Array, q: Array, m: Any, at: Any
 ) -> tuple[Array, Array]:
     """Even edges, odd edges, even inner points, odd inner points.
 
     Even and odd points live in arrays of their own during the iterations: strided slices inside
     them cost 1.7 times as much.
     """
-    length2, stretch2, rest2, bend2 = (_halves(x) for x in (length, stretch, rest, bend))
+    (at_edges, at_inner) = (_halves(x) for x in at)
+    start = _halves(p), _halves(q), tuple(_halves(x) for x in m)
 
     def iteration(x: Any) -> Any:
-        (p0, p1), (q0, q1) = x
-        p0, p1, q0 = _edges(p0, p1, q0, length2[0], stretch2[0])
-        p1, p0_after, q1 = _edges(p1, p0[1:], q1, length2[1], stretch2[1])
+        (p0, p1), (q0, q1), ((e0, e1), (i0, i1)) = x
+        p0, p1, q0, e0 = _edges(edge, p0, p1, q0, e0, at_edges[0])
+        p1, p0_after, q1, e1 = _edges(edge, p1, p0[1:], q1, e1, at_edges[1])
         p0 = jnp.concatenate([p0[:1], p0_after])
-        q0, q1 = _inner(q0, q1, rest2[0], bend2[0])
-        q1, q0_after = _inner(q1, q0[1:], rest2[1], bend2[1])
+        q0, q1, i0 = _inner(inner, q0, q1, i0, at_inner[0])
+        q1, q0_after, i1 = _inner(inner, q1, q0[1:], i1, at_inner[1])
         q0 = jnp.concatenate([q0[:1], q0_after])
-        return (p0, p1), (q0, q1)
+        return (p0, p1), (q0, q1), ((e0, e1), (i0, i1))
 
-    p2, q2 = _repeat(iteration, (_halves(p), _halves(q)), iterations)
+    p2, q2, _ = _repeat(iteration, start, iterations)
     return _woven(*p2), _woven(*q2)
 
 
@@ -140,16 +265,16 @@ def _woven(even: Array, odd: Array) -> Array:
     return jnp.concatenate([pairs, even[n:]])
 
 
-def _edges(first: Array, second: Array, q: Array, length: Array, factors: Any) -> Any:
-    """Stretch-shear of edges from the rows of `first` to those of `second`; the longer one's last
-    row, if it has no partner, stays."""
+def _edges(edge: Any, first: Array, second: Array, q: Array, m: Any, at: Any) -> Any:
+    """Edges from the rows of `first` to those of `second`; the longer one's last row, if it has
+    no partner, stays."""
     n = q.shape[0]
-    a, b, q = rods.stretch_shear(first[:n], second[:n], q, length, factors)
-    return jnp.concatenate([a, first[n:]]), jnp.concatenate([b, second[n:]]), q
+    a, b, q, m = edge(first[:n], second[:n], q, m, at)
+    return jnp.concatenate([a, first[n:]]), jnp.concatenate([b, second[n:]]), q, m
 
 
-def _inner(first: Array, second: Array, rest: Array, factors: Any) -> Any:
-    """Bend-twist between the rows of `first` and those of `second`."""
-    n = rest.shape[0]
-    a, b = rods.bend_twist(first[:n], second[:n], rest, factors)
-    return jnp.concatenate([a, first[n:]]), jnp.concatenate([b, second[n:]])
+def _inner(inner: Any, first: Array, second: Array, m: Any, at: Any) -> Any:
+    """Inner points between the rows of `first` and those of `second`."""
+    n = at[0].shape[0]
+    a, b, m = inner(first[:n], second[:n], m, at)
+    return jnp.concatenate([a, first[n:]]), jnp.concatenate([b, second[n:]]), m

@@ -265,6 +265,8 @@ class State:
         orientations: q of the edges, shape (points - 1, 4, strands).
         shapes: what each kind of bond remembers, Omega_j, shape (points - 2, 4, 3, strands).
         fractions: bonded fraction b_j of each kind in [0, 1], shape (points - 2, 4, strands).
+        forces: in the edges, above 0 along the edge where it is pulled [N], shape
+            (points - 1, 3, strands); None with solvers that do not keep them.
     """
 
     positions: Array
@@ -272,6 +274,7 @@ class State:
     orientations: Array
     shapes: Array
     fractions: Array
+    forces: Array | None = None
 
     @property
     def points(self) -> Array:

@@ -20,7 +20,14 @@ TOLERANCE = {"float64": 1e-13, "float32": 1e-6}
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 stretch_shear, bend_twist = jax.jit(rods.stretch_shear), jax.jit(rods.bend_twist)
-solve = jax.jit(PositionBased.solve)
+
+
+@jax.jit
+def solve(solver: PositionBased, rod: Rod, p: jax.Array, q: jax.Array, rest: jax.Array) -> tuple:
+    """Positions and orientations after a solve; the start and dt matter to other solvers only."""
+    return solver.solve(rod, None, p, q, rest, 1.0)[:2]  # type: ignore[arg-type]
+
+
 slopes = jax.jit(jax.vmap(jax.grad(partial(stiffness_per_iteration, iterations=2))))
 violation, turn = jax.jit(rods.stretch_shear_violation), jax.jit(rods.bend_twist_violation)
 darboux, multiply = jax.jit(rods.darboux), jax.jit(quat.multiply)

@@ -66,7 +66,8 @@ def as_oracle(effect: object) -> dict:
 
 
 def outer(state: State) -> oracle.Hair:
-    return oracle.Hair(*(np.moveaxis(np.asarray(x), -1, 0) for x in vars(state).values()))
+    kept = [np.moveaxis(np.asarray(x), -1, 0) for x in vars(state).values() if x is not None]
+    return oracle.Hair(*kept)
 
 
 def oracle_settings(scene: Scene) -> oracle.Settings:
