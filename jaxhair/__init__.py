@@ -1,13 +1,14 @@
 """Differentiable simulation of hair that keeps its shape through side-chain bonds."""
 
 from jaxhair import scenes, treatments
+from jaxhair.accuracy import cheapest
 from jaxhair.bonds import Bonds, Cut, Reform
 from jaxhair.contact import HairContact
 from jaxhair.direct import Direct
 from jaxhair.export import save
 from jaxhair.fibre import Fibre, PhysicalFibre, Soften
 from jaxhair.files import Curves, read_curves, write_curves
-from jaxhair.forces import Drag, DryingWind, Gravity, Wind
+from jaxhair.forces import Drag, DryingWind, Gravity, TipForce, Wind
 from jaxhair.holding import Hold, Unloaded, Wound
 from jaxhair.obstacles import Cylinder, Floor, Sphere
 from jaxhair.pytree import pytree
@@ -43,9 +44,11 @@ __all__ = [
     "Sphere",
     "State",
     "Strands",
+    "TipForce",
     "Unloaded",
     "Wind",
     "Wound",
+    "cheapest",
     "named_leaves",
     "pytree",
     "read_curves",

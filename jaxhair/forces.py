@@ -1,4 +1,4 @@
-"""External forces, as changes of velocity over a step: gravity, drag and wind."""
+"""External forces, as changes of velocity over a step: gravity, a tip force, drag and wind."""
 
 from typing import Any
 
@@ -30,6 +30,29 @@ class Gravity(VelocityEffect):
         """g dt at every point."""
         g = column(self.acceleration, state.positions)
         return jnp.broadcast_to(g * dt, state.positions.shape)
+
+
+@pytree
+class TipForce(VelocityEffect):
+    """dv = F dt / m at the last point: a weight or a pull at the tip. Needs a `PhysicalFibre`.
+
+    Arguments:
+        force: F [N], shape (3,); a weight of 1 mg is (0, 0, -9.8e-6).
+    """
+
+    force: Any
+
+    def __post_init__(self) -> None:
+        check.vector("TipForce.force", self.force)
+
+    def velocity_change(self, rod: Rod, state: State, dt: float) -> Array:
+        """F dt / m at each strand's last point, 0 elsewhere."""
+        mass = rod.unit_mass()
+        here = rod.point_exists()
+        last = here & ~jnp.concatenate([here[1:], jnp.zeros_like(here[:1])])
+        at_tip = jnp.where(last, rod.point_weights, 0) / mass
+        change = column(self.force, state.positions) * dt * at_tip
+        return jnp.broadcast_to(change, state.positions.shape)
 
 
 @pytree

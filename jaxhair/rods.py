@@ -74,6 +74,11 @@ class Rod:
         none = jnp.zeros_like(self.lengths[:1])
         return (jnp.concatenate([none, self.lengths]) + jnp.concatenate([self.lengths, none])) / 2
 
+    def unit_mass(self) -> Array:
+        """Mass of an edge of mean length [kg], that of a point of weight 1. Needs a material."""
+        assert self.material is not None, "a Scene sees to a physical fibre where one is needed"
+        return self.material.linear_density * self.material.unit_length
+
     def bending(self) -> Array:
         """Spring constants 4 B / h of |Omega - Omega_o|^2 / 2 [J], shape (points - 2, 3, ...).
 

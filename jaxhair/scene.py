@@ -12,6 +12,7 @@ from jaxhair import check
 from jaxhair.bonds import Bonds
 from jaxhair.effects import Effect, of_kind
 from jaxhair.fibre import Fibre, PhysicalFibre
+from jaxhair.forces import TipForce
 from jaxhair.holding import Wound
 from jaxhair.pytree import pytree, static
 from jaxhair.solvers import PositionBased, Solver
@@ -92,6 +93,7 @@ class Scene:
             if names.count(name) > 1:
                 raise ValueError(f"scene.phases has {name!r} twice; names must differ")
         self._check_bonds()
+        self._check_forces()
         self._check_rods()
 
     def _check_bonds(self) -> None:
@@ -104,6 +106,14 @@ class Scene:
         for name, value in vars(self.fibre).items():
             if value is not None and np.shape(value) not in ((), (1,), (strands,)):
                 check.shape(f"fibre.{name}", value, (strands,))
+
+    def _check_forces(self) -> None:
+        for phase in self.phases:
+            if of_kind(phase.effects, TipForce) and isinstance(self.fibre, Fibre):
+                raise ValueError(
+                    f"phase {phase.name!r} has a TipForce, in newton, and scene.fibre is a Fibre, "
+                    "which has no mass; it must be a PhysicalFibre"
+                )
 
     def _check_rods(self) -> None:
         longest = check.known(self.strands.lengths)

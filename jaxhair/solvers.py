@@ -159,8 +159,8 @@ class Compliant(_Sweeping):
         shape, share = rest
         spring = share * _relative_springs(rod, dt)
         # alpha of stretch and shear, 1 / (E A l) in the units of the weights
+        unit_mass = rod.unit_mass()
         assert rod.material is not None
-        unit_mass = rod.material.linear_density * rod.material.unit_length
         alpha = unit_mass / (rod.material.axial_stiffness * length * dt**2)
         stretch = rods.stretch_shear_factors(w[:-1], w[1:], wq, length, alpha * length**2)
         whole = w[:-1] + w[1:] + length**2 * (4 * wq + alpha)
@@ -187,9 +187,7 @@ class Compliant(_Sweeping):
 
 def _relative_springs(rod: Rod, dt: float) -> Array:
     """4 B dt^2 / (h m) with the mass m of an edge of mean length: (points - 2, 3, ...) [m^2]."""
-    assert rod.material is not None
-    mass = rod.material.linear_density * rod.material.unit_length
-    return rod.bending() * dt**2 / mass
+    return rod.bending() * dt**2 / rod.unit_mass()
 
 
 # Sweeps. `edge` and `inner` project a constraint: they take the two things it joins (and the
