@@ -1,4 +1,4 @@
-"""The command line: `python -m jaxhair simulate perm --output perm.png`."""
+"""The command line: `python -m jaxhair simulate perm --output perm.png`, and `accuracy`."""
 
 import argparse
 import sys
@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from jaxhair import check, scenes
+from jaxhair.accuracy import command as accuracy
+from jaxhair.direct import Direct
 from jaxhair.export import check_drawing, check_ending, check_new, save
 from jaxhair.recording import NotFinite, simulate
 from jaxhair.scene import Scene
-from jaxhair.solvers import SWEEPS, PositionBased
+from jaxhair.solvers import SWEEPS, Compliant, PositionBased, Solver
 from jaxhair.strands import BONDS
 from jaxhair.treatments import wash
 
@@ -39,8 +41,17 @@ def parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--no-contact", action="store_true", help="hairs pass through each other")
     run.add_argument("--wash", action="store_true", help="wash the hair at the end")
-    run.add_argument("--iterations", type=int, default=5, help="of the solver in a step (5)")
-    run.add_argument("--sweep", choices=SWEEPS, default="red-black", help="order (red-black)")
+    run.add_argument(
+        "--solver",
+        choices=SOLVERS,
+        default="paper",
+        help="the paper's, with its k; or, with stiffnesses in pascal, compliant constraints "
+        "(XPBD) or the direct solver (paper)",
+    )
+    run.add_argument("--iterations", type=int, help="of paper or compliant in a step (5)")
+    run.add_argument("--sweep", choices=SWEEPS, help="order, of the same (red-black)")
+    run.add_argument("--newton-steps", type=int, help="of direct in a step (1)")
+    run.add_argument("--substeps", type=int, default=1, help="solves in a step (1)")
     run.add_argument("--steps-per-second", type=float, default=360, help="time steps (360)")
     run.add_argument("--seconds", type=float, help="stop after this simulated time")
     run.add_argument("--fps", type=float, default=30.0, help="frames a second (30)")
@@ -48,8 +59,15 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--color-by", choices=BONDS, help="show a bonded fraction, blue 0 to red 1")
     run.add_argument("--size", type=int, default=800, help="of pictures, pixels (800)")
     run.add_argument("--quiet", action="store_true", help="show no progress")
+    accuracy.add_command(commands)
     return top
 
+
+SOLVERS: dict[str, type[Any]] = {
+    "paper": PositionBased,
+    "compliant": Compliant,
+    "direct": Direct,
+}
 
 UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
@@ -72,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns 0, or 2 after a mistake in what was asked, or 1 if it failed."""
     options = parser().parse_args(arguments)
     try:
-        return _simulate(options)
+        return accuracy.run(options) if options.command == "accuracy" else _simulate(options)
     except (ValueError, OSError, ImportError, NotFinite) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, NotFinite) else 2
@@ -101,13 +119,33 @@ def _scene(options: argparse.Namespace) -> Scene:
         options.scene,
         seed=options.seed,
         contact=not options.no_contact,
-        solver=PositionBased(iterations=options.iterations, sweep=options.sweep),
+        solver=_solver(options),
         dt=1 / options.steps_per_second,
         **chosen,
     )
     if options.wash:
         scene = scene.then(*wash(free=scene.phases[-1].effects, seconds=2.0, unload=False))
     return scene if options.seconds is None else scene.first(options.seconds)
+
+
+def _solver(options: argparse.Namespace) -> Solver:
+    """The solver that is asked for; options that it does not have are mistakes."""
+    chosen: dict[str, Any] = {"substeps": options.substeps}
+    direct = options.solver == "direct"
+    for name, of in (
+        ("iterations", "paper or compliant"),
+        ("sweep", "paper or compliant"),
+        ("newton_steps", "direct"),
+    ):
+        value = getattr(options, name)
+        if value is None:
+            continue
+        if direct != (of == "direct"):
+            flag = "--" + name.replace("_", "-")
+            raise ValueError(f"{flag} is {value!r}; it must be left out unless --solver is {of}")
+        chosen[name] = value
+    solver: Solver = SOLVERS[options.solver](**chosen)
+    return solver
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -60,27 +60,19 @@ def product(blocks: Blocks, x: Pair) -> Pair:
     return above, below
 
 
-@jax.custom_jvp
-def solve(blocks: Blocks, right: Pair) -> Pair:
-    """x with blocks x = right. Its derivative, x' = blocks^-1 (right' - blocks' x), uses the
-    factors of the solution again."""
+def solve(blocks: Blocks, right: Pair) -> tuple[Pair, "Factors"]:
+    """x with blocks x = right, and the factors, which `solve_again` uses."""
     factors, reduced = _eliminated(blocks, right)
-    return _back(factors, reduced)
+    return _back(factors, reduced), factors
 
 
-@solve.defjvp
-def _solve_jvp(primals: tuple[Blocks, Pair], tangents: tuple[Blocks, Pair]) -> tuple[Pair, Pair]:
-    blocks, right = primals
-    blocks_dot, right_dot = tangents
-    factors, reduced = _eliminated(blocks, right)
-    x = _back(factors, reduced)
-    moved = product(blocks_dot, x)
-    residual = right_dot[0] - moved[0], right_dot[1] - moved[1]
-    return x, _back(factors, _forward(factors, residual))
+def solve_again(factors: "Factors", right: Pair) -> Pair:
+    """x for another right side, in which it is linear."""
+    return _back(factors, _forward(factors, right))
 
 
 @pytree
-class _Factors:
+class Factors:
     """Of each edge's reduced diagonal block: N^-1, G = N^-1 C, (K + C' G)^-1, the last one with G
     to its left and with S to its right; and t and S themselves."""
 
@@ -93,7 +85,7 @@ class _Factors:
     s: Any
 
 
-def _eliminated(blocks: Blocks, right: Pair) -> tuple[_Factors, Pair]:
+def _eliminated(blocks: Blocks, right: Pair) -> tuple[Factors, Pair]:
     """Factors, and the right side after elimination from root to tip, solved for block by block."""
     n, phi = right
     strands = n.shape[-1]
@@ -126,11 +118,11 @@ def _eliminated(blocks: Blocks, right: Pair) -> tuple[_Factors, Pair]:
     first = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (*x.shape[1:-1], strands)), rows)
     _, found = lax.scan(edge, first, (t[:, None], s, following))
     inverse_compliance, g, inverse, g_inverse, inverse_s, n, phi = found
-    factors = _Factors(inverse_compliance, g, inverse, g_inverse, inverse_s, t, s)
+    factors = Factors(inverse_compliance, g, inverse, g_inverse, inverse_s, t, s)
     return factors, (n, phi)
 
 
-def _forward(factors: _Factors, right: Pair) -> Pair:
+def _forward(factors: Factors, right: Pair) -> Pair:
     """What `_eliminated` does to a right side, for another one."""
     n, phi = right
 
@@ -143,7 +135,7 @@ def _forward(factors: _Factors, right: Pair) -> Pair:
     return lax.scan(edge, (n[0], phi[0]), (factors, *following))[1]
 
 
-def _back(factors: _Factors, reduced: Pair) -> Pair:
+def _back(factors: Factors, reduced: Pair) -> Pair:
     """From tip to root: what each edge's solution is once the next edge's is known."""
 
     def edge(after: Pair, at: Any) -> tuple[Pair, Pair]:

@@ -1,14 +1,16 @@
 """The direct solver: Newton's method for all constraints of a strand at once."""
 
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxhair import check, hessian
 from jaxhair import quaternion as quat
-from jaxhair.block_tridiagonal import Blocks, Pair, solve
-from jaxhair.hessian import Units
+from jaxhair.block_tridiagonal import Blocks, Pair, solve, solve_again
+from jaxhair.hessian import Units, padded
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.solvers import Solver
@@ -35,13 +37,14 @@ class Direct(Solver):
 
     Arguments:
         newton_steps: in each step.
-        frame_inertia: what holds a frame back from turning, as a part of its edge's m l^2. It
-            keeps strands solvable of which nothing else holds the twist.
+        frame_inertia: what holds a frame back from twisting, as a part of its edge's m l^2, about
+            (radius / l)^2 in truth. Where all bonds are cut, nothing else does. As frames have no
+            speed of their own it acts as a friction, which grows as dt falls.
         substeps: see `jaxhair.solvers.Solver`.
     """
 
     newton_steps: int = static(default=1)
-    frame_inertia: Any = 1e-3
+    frame_inertia: Any = 1e-5
     substeps: int = static(default=1)
     compliant: ClassVar[bool] = True
     keeps_forces: ClassVar[bool] = True
@@ -62,43 +65,112 @@ class Direct(Solver):
         assert state.forces is not None
         n = state.forces / unit.force
         for _ in range(self.newton_steps):
-            joints = hessian.joints(rod, unit, state.orientations, q, rest, dt)
-            blocks, right = self._linearised(rod, unit, joints, positions / unit.length, q, n)
-            n, phi = solve(blocks, right)
+            known = Known(rod, rest, state.orientations, positions / unit.length, q, n)
+            n, phi = newton_step(known, jnp.asarray(self.frame_inertia, q.dtype), dt)
             q = quat.unit(quat.multiply(q, quat.from_rotation_vector(phi)))
-        pull = hessian.padded(n, 0, 1) - hessian.padded(n, 1, 0)
-        p = positions + unit.length * rod.point_weights * pull
-        return p, q, n * unit.force
+        return positions + unit.length * _moved(rod, n), q, n * unit.force
 
-    def _linearised(
-        self, rod: Rod, unit: Units, joints: hessian.Joints, p: Array, q: Array, n: Array
-    ) -> tuple[Blocks, Pair]:
-        """The equations of the class, for new forces and rotations phi in the frames' own axes.
 
-        R(q) e3 turns by d1 phi_2 - d2 phi_1.
-        """
-        length, w, free = rod.lengths / unit.length, rod.point_weights, rod.edge_weights
-        d1, d2, d3 = quat.axes(q)
-        inertia = self.frame_inertia * length**3 * jnp.ones((1, 3, 1), p.dtype)
-        eye = jnp.eye(3, dtype=p.dtype)[None, :, :, None]
-        stiffness = hessian.padded(joints.of_first, 0, 1) + hessian.padded(joints.of_second, 1, 0)
-        stiffness = stiffness + inertia[:, :, None] * eye + hessian.of_force(length * n, d1, d2, d3)
-        turned = jnp.stack([-d2, d1, jnp.zeros_like(d1)], axis=2)
-        compliance, shared = w[:-1] + w[1:] + length * unit.compliance, w[1:-1]
-        gap = length * d3 - (p[1:] - p[:-1])
-        if rod.ragged:
-            exists = rod.edge_exists().astype(p.dtype)
-            compliance, shared, gap = compliance + 1 - exists, shared * exists[1:], gap * exists
-        may_turn = free[:, None]
-        blocks = Blocks(
-            compliance=compliance,
-            coupling=-length[:, None] * turned * may_turn,
-            stiffness=stiffness * may_turn + (1 - may_turn) * eye,
-            next_compliance=shared,
-            next_stiffness=joints.between * may_turn[:-1] * may_turn[1:],
-        )
-        moments = hessian.padded(joints.on_first, 0, 1) + hessian.padded(joints.on_second, 1, 0)
-        return blocks, (gap, moments * free)
+class Known(NamedTuple):
+    """What a Newton step starts from, lengths and forces in `Units`.
+
+    rod, rest: as in `Solver.solve`. before: orientations at the start of the time step.
+    positions: predicted. orientations, forces: from which the step goes.
+    """
+
+    rod: Rod
+    rest: Any
+    before: Array
+    positions: Array
+    orientations: Array
+    forces: Array
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def newton_step(known: Known, frame_inertia: Array, dt: Any) -> Pair:
+    """The solution of the linearised equations: forces, and rotations of the frames in their own
+    axes.
+
+    Its derivative is that of the equations, `residual`, solved with the factors of the step: the
+    matrix itself is never differentiated, which would cost five times as much.
+    """
+    return solve(*linearised(known, frame_inertia, dt))[0]
+
+
+@newton_step.defjvp
+def _newton_step_jvp(dt: Any, primals: Any, tangents: Any) -> tuple[Pair, Pair]:
+    known, frame_inertia = primals
+    x, factors = solve(*linearised(known, frame_inertia, dt))
+    _, change = jax.jvp(lambda k, inertia: residual(k, inertia, dt, x), primals, tangents)
+    return x, solve_again(factors, jax.tree.map(jnp.negative, change))
+
+
+def linearised(known: Known, frame_inertia: Array, dt: Any) -> tuple[Blocks, Pair]:
+    """The equations of `Direct` as a matrix and a right side, for forces and rotations phi.
+
+    R(q) e3 turns by d1 phi_2 - d2 phi_1.
+    """
+    rod, p = known.rod, known.positions
+    unit = Units.of(rod, dt)
+    length, w, may_turn = rod.lengths / unit.length, rod.point_weights, rod.edge_weights[:, None]
+    d1, d2, d3 = quat.axes(known.orientations)
+    bends = hessian.joints(rod, unit, known.before, known.orientations, known.rest, dt)
+    of_first, of_second, between = hessian.joint_matrices(bends)
+    eye = jnp.eye(3, dtype=p.dtype)[None, :, :, None]
+    stiffness = (
+        padded(of_first, 0, 1)
+        + padded(of_second, 1, 0)
+        + frame_inertia * length[:, None] ** 3 * eye
+        + hessian.pull_matrix(hessian.pulls(length * known.forces, d1, d2, d3))
+    )
+    gap = length * d3 - (p[1:] - p[:-1])
+    compliance, shared = w[:-1] + w[1:] + length * unit.compliance, w[1:-1]
+    if rod.ragged:
+        exists = rod.edge_exists().astype(p.dtype)
+        compliance, shared, gap = compliance + 1 - exists, shared * exists[1:], gap * exists
+    blocks = Blocks(
+        compliance=compliance,
+        coupling=length[:, None] * jnp.stack([d2, -d1, 0 * d1], axis=2) * may_turn,
+        stiffness=stiffness * may_turn + (1 - may_turn) * eye,
+        next_compliance=shared,
+        next_stiffness=between * may_turn[:-1] * may_turn[1:],
+    )
+    on_first, on_second = hessian.acting(bends, bends.moment)
+    moments = padded(on_first, 0, 1) + padded(on_second, 1, 0)
+    return blocks, (gap, -moments * rod.edge_weights)
+
+
+def residual(known: Known, frame_inertia: Array, dt: Any, x: Pair) -> Pair:
+    """By how much forces and rotations x miss the equations: matrix times x, less the right side.
+
+    Written with vectors alone, because it is what is differentiated.
+    """
+    (n, phi), rod = x, known.rod
+    unit = Units.of(rod, dt)
+    length = rod.lengths / unit.length
+    p = known.positions + _moved(rod, n)
+    d1, d2, d3 = quat.axes(known.orientations)
+    turned = d3 + d1 * phi[:, 1:2] - d2 * phi[:, :1]
+    gap = p[1:] - p[:-1] - length * turned - length * unit.compliance * n
+    bends = hessian.joints(rod, unit, known.before, known.orientations, known.rest, dt)
+    first, second = hessian.joint_moments(bends, phi[:-1], phi[1:])
+    pulled = hessian.pulls(length * known.forces, d1, d2, d3)
+    arm = jnp.concatenate([quat.dot(n, d2), -quat.dot(n, d1), jnp.zeros_like(phi[:, :1])], axis=1)
+    moments = (
+        padded(first, 0, 1)
+        + padded(second, 1, 0)
+        + frame_inertia * length**3 * phi
+        + hessian.pull_moments(pulled, phi)
+        + length * arm
+    )
+    if rod.ragged:
+        gap = jnp.where(rod.edge_exists(), gap, -n)
+    return gap, jnp.where(rod.edge_weights > 0, moments, phi)
+
+
+def _moved(rod: Rod, n: Array) -> Array:
+    """By how much forces n move the points: their weight times n_i - n_(i-1)."""
+    return rod.point_weights * (padded(n, 0, 1) - padded(n, 1, 0))
 
 
 def _turned(rod: Rod, p: Array, q: Array) -> Array:

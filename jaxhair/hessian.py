@@ -37,25 +37,21 @@ class Units(NamedTuple):
 
 
 class Joints(NamedTuple):
-    """Stiffness of each inner point's bend and twist against rotations of the edge before it
-    (first), of the edge after it (second), and between both, each of shape (points - 2, 3, 3,
-    strands); and the moments on the two edges, shape (points - 2, 3, strands)."""
+    """Bend and twist at the inner points, in units.
 
-    of_first: Array
-    of_second: Array
-    between: Array
-    on_first: Array
-    on_second: Array
+    turn: r, shape (points - 2, 4, strands). spring: 4 B / h, against small further turns.
+    moment: m = (4 B / h) (Omega - shape), shape (points - 2, 3, strands), as spring.
+    cover: X, see `joint_matrices`, shape (points - 2, 1, strands).
+    """
+
+    turn: Array
+    spring: Array
+    moment: Array
+    cover: Array
 
 
 def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float) -> Joints:
-    """Derivatives of sum_i (4 B / h) |c|^2 / 2, c = Omega - shape, in units.
-
-    With rotations phi_1, phi_2 of the two edges in their own axes and a = (r_w I + [Omega]x) / 2,
-    c changes by a phi_2 - a' phi_1 to first order. To second order, with the moment m = (4 B / h) c
-    and the mean s and difference d of the rotations, the energy has the term -(r_w / 4) m . (s x d)
-    besides, which is taken as it is, and terms in |m| |Omega| |s|^2. Both are bounded by
-    X |s|^2 / 2, X = |m|^2 / (4 min 4 B / h) + |m| |Omega|.
+    """What the bends and twists of orientations q are.
 
     Arguments:
         before: orientations at the start of the step, for the material's damping.
@@ -66,8 +62,7 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
     spring = share * rod.bending() / (unit.force * unit.length)
     r = rods.darboux(q[:-1], q[1:])
     r = quat.same_hemisphere(r, shape) * r
-    c = (r - shape)[:, 1:]
-    moment = spring * c
+    moment = spring * (r - shape)[:, 1:]
     if rod.material is not None and rod.material.damping_time is not None:
         rate = rod.material.damping_time / dt
         old = rods.darboux(before[:-1], before[1:])
@@ -76,42 +71,108 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
         spring = spring * (1 + rate)
     weakest = jnp.min(spring, axis=1, keepdims=True)
     bent = jnp.where(weakest > 0, quat.dot(moment, moment) / jnp.where(weakest > 0, weakest, 1), 0)
-    cover = bent / 4 + quat.safe_norm(moment) * quat.safe_norm(r[:, 1:])
-    held = cover[:, None] / 4 * jnp.eye(3, dtype=q.dtype)[None, :, :, None]
-    a = _matrix(r[:, 0], r[:, 1:]) / 2
-    a_t = jnp.swapaxes(a, 1, 2)
-    spring = spring[:, :, None]
-    return Joints(
-        of_first=_product(a, spring * a_t) + held,
-        of_second=_product(a_t, spring * a) + held,
-        between=_product(a, spring * a) - _matrix(0 * r[:, 0], r[:, :1] * moment) / 4 - held,
-        on_first=jnp.sum(a * moment[:, None], axis=2),
-        on_second=-jnp.sum(a_t * moment[:, None], axis=2),
+    rounding = 32 * jnp.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)
+    cover = bent / 4 + quat.safe_norm(moment) * quat.safe_norm(r[:, 1:]) + rounding
+    return Joints(r, spring, moment, cover)
+
+
+def joint_moments(joints: Joints, phi1: Array, phi2: Array) -> tuple[Array, Array]:
+    """Derivatives of the joints' energy after rotations phi_1 of the edges before them and phi_2
+    of those after them, by these rotations; to first order in them, `joint_matrices` times them.
+
+    All of shape (points - 2, 3, strands).
+    """
+    w, v = joints.turn[:, :1], joints.turn[:, 1:]
+    both = phi1 + phi2
+    change = (w * (phi2 - phi1) + quat.cross(v, both)) / 2
+    m = joints.moment + joints.spring * change
+    first, second = acting(joints, m)
+    held, twisted = joints.cover * both / 4, w * joints.moment / 4
+    return (
+        first + held + quat.cross(twisted, phi2),
+        second + held - quat.cross(twisted, phi1),
     )
 
 
-def of_force(n: Array, d1: Array, d2: Array, d3: Array) -> Array:
-    """Second derivative of -n . d3 in a rotation of its frame, without the negative part.
+def acting(joints: Joints, moment: Array) -> tuple[Array, Array]:
+    """What moments m at the joints do to the edges before and after them, -a m and a' m."""
+    direct, across = joints.turn[:, :1] * moment / 2, quat.cross(joints.turn[:, 1:], moment) / 2
+    return -direct - across, direct - across
 
-    In the frame's axes it is A = [[n3, 0, -n1/2], [0, n3, -n2/2], [-n1/2, -n2/2, 0]]. Across
-    (n1, n2) its eigenvalue is n3; in the plane of (n1, n2) and d3 they are (n3 +- |n|) / 2, so that
-    |A| has a closed form, and (A + |A|) / 2 is returned.
 
-    Arguments: n: shape (edges, 3, strands); d1, d2, d3: of the same shape.
-    Returns shape (edges, 3, 3, strands).
+def joint_matrices(joints: Joints) -> tuple[Array, Array, Array]:
+    """Second derivatives of sum (4 B / h) |Omega - shape|^2 / 2 by phi_1, by phi_2 and, with the
+    sign turned, by both; each of shape (points - 2, 3, 3, strands).
+
+    With a = (r_w I + [Omega]x) / 2, Omega changes by a phi_2 - a' phi_1 to first order. To second
+    order, with the mean s and the difference d of the rotations, the energy has the term
+    -(r_w / 4) m . (s x d), which is taken as it is, and terms in |m| |Omega| |s|^2. Both are
+    bounded by X |s|^2 / 2 with the cover X = |m|^2 / (4 min 4 B / h) + |m| |Omega|. It also has
+    what rounding may take from 4 B / h, so that a strand that nothing keeps from spinning about
+    itself can be solved for.
     """
+    w, v = joints.turn[:, :1], joints.turn[:, 1:]
+    held = joints.cover[:, None] / 4 * jnp.eye(3, dtype=v.dtype)[None, :, :, None]
+    a = _matrix(w[:, 0], v) / 2
+    a_t, spring = jnp.swapaxes(a, 1, 2), joints.spring[:, :, None]
+    twisted = _matrix(jnp.zeros_like(w[:, 0]), w * joints.moment / 4)
+    return (
+        _product(a, spring * a_t) + held,
+        _product(a_t, spring * a) + held,
+        _product(a, spring * a) - twisted - held,
+    )
+
+
+class Pulls(NamedTuple):
+    """Forces n on frames: along d1, d2 and d3, |n|, and what makes the second derivative of
+    -n . d3, A = [[n3, 0, -n1/2], [0, n3, -n2/2], [-n1/2, -n2/2, 0]], lose its negative part.
+
+    Across (n1, n2) the eigenvalue of A is n3; in the plane of (n1, n2) and d3 they are
+    (n3 +- |n|) / 2, so that |A| has a closed form, and so has (A + |A|) / 2.
+    """
+
+    n1: Array
+    n2: Array
+    pulled: Array
+    in_plane: Array
+    turning: Array
+    along: Array
+
+
+def pulls(n: Array, d1: Array, d2: Array, d3: Array) -> Pulls:
+    """n, and the frame's axes, each of shape (edges, 3, strands)."""
     n1, n2, n3 = (quat.dot(n, d) for d in (d1, d2, d3))
-    size = quat.safe_norm(n)
+    size, along = quat.safe_norm(n), jnp.abs(n3)
     none = size == 0
     inverse = jnp.where(none, 0, 1 / jnp.where(none, 1, size))
-    along = jnp.abs(n3)
-    in_plane = (size - along) * inverse / (4 * (size + along) + none)
-    pulled, turning = jnp.maximum(n3, 0), -(1 + n3 * inverse) / 4
-    across = (n1 * n1 + n2 * n2) * inverse / 4
+    return Pulls(
+        n1,
+        n2,
+        pulled=jnp.maximum(n3, 0),
+        in_plane=(size - along) * inverse / (4 * jnp.where(none, 1, size + along)),
+        turning=-(1 + n3 * inverse) / 4,
+        along=(n1 * n1 + n2 * n2) * inverse / 4,
+    )
+
+
+def pull_moments(pulls: Pulls, phi: Array) -> Array:
+    """`pull_matrix` times rotations phi, shape (edges, 3, strands)."""
+    n1, n2, pulled, in_plane, turning, along = pulls
+    x, y, z = (phi[:, i : i + 1] for i in range(3))
+    on_plane = n1 * x + n2 * y
+    both = in_plane * on_plane + turning * z
+    return jnp.concatenate(
+        [pulled * x + both * n1, pulled * y + both * n2, turning * on_plane + along * z], axis=1
+    )
+
+
+def pull_matrix(pulls: Pulls) -> Array:
+    """(A + |A|) / 2 of `Pulls`, shape (edges, 3, 3, strands)."""
+    n1, n2, pulled, in_plane, turning, along = pulls
     rows = [
         [pulled + in_plane * n1 * n1, in_plane * n1 * n2, turning * n1],
         [in_plane * n1 * n2, pulled + in_plane * n2 * n2, turning * n2],
-        [turning * n1, turning * n2, across],
+        [turning * n1, turning * n2, along],
     ]
     return jnp.stack([jnp.concatenate(row, axis=1) for row in rows], axis=1)
 

@@ -39,6 +39,29 @@ def test_simulate_writes_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert arrays["parameter:fibre.peeling_rate"] == pytest.approx(0.33)
 
 
+@pytest.mark.parametrize(
+    ("more", "solver", "physical"),
+    [
+        ("--solver paper --substeps 2", jh.PositionBased(substeps=2), False),
+        (
+            "--solver compliant --iterations 3 --sweep sequential",
+            jh.Compliant(iterations=3, sweep="sequential"),
+            True,
+        ),
+        ("--solver direct --newton-steps 2", jh.Direct(newton_steps=2), True),
+    ],
+)
+def test_simulate_with_another_solver(
+    more: str, solver: object, physical: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "perm.npz"
+    assert simulate_main([*PERM.split(), str(path), *more.split()]) == 0
+    with np.load(path) as arrays:
+        assert np.all(np.isfinite(arrays["positions"]))
+        assert ("parameter:fibre.young_modulus" in arrays.files) == physical
+        assert str(solver) in str(arrays["scene"])
+
+
 def test_simulate_in_a_process_of_its_own(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "jaxhair", *PERM.split(), str(tmp_path / "perm.hair")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -57,6 +80,20 @@ def test_simulate_in_a_process_of_its_own(tmp_path: Path) -> None:
         (["--output", "OUT/x.npz", "--iterations", "0"], ["iterations", "at least 1"]),
         (["--output", "OUT/x.npz", "--rod-diameter", "2cm"], ["--rod-diameter", "bed-hair"]),
         (["--output", "OUT/x.npz", "--steps-per-second", "0"], ["--steps-per-second"]),
+        (["--output", "OUT/x.npz", "--substeps", "0"], ["substeps", "at least 1"]),
+        (["--output", "OUT/x.npz", "--newton-steps", "2"], ["--newton-steps", "direct"]),
+        (
+            ["--output", "OUT/x.npz", "--solver", "direct", "--iterations", "5"],
+            ["--iterations", "paper or compliant"],
+        ),
+        (
+            ["--output", "OUT/x.npz", "--solver", "direct", "--sweep", "red-black"],
+            ["--sweep", "paper or compliant"],
+        ),
+        (
+            ["--output", "OUT/x.npz", "--solver", "direct", "--newton-steps", "0"],
+            ["newton_steps", "at least 1"],
+        ),
     ],
 )
 def test_simulate_refuses(

@@ -1,0 +1,207 @@
+"""`python -m jaxhair accuracy`: measures settings and writes tables and pictures of them."""
+
+import argparse
+import csv
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+
+from jaxhair import check
+from jaxhair.accuracy import grid, table
+from jaxhair.accuracy.grid import Plan
+from jaxhair.accuracy.measuring import Row, measure
+from jaxhair.accuracy.problem import PARAMETERS, Reference, reference
+from jaxhair.accuracy.stretch import Stretch, stretch
+from jaxhair.export import check_new
+from jaxhair.output import new_file
+
+FILES = ("accuracy.csv", "accuracy.json", "stretch.csv", "accuracy.png", "theory.png")
+BASE_ITERATIONS = 5
+"""With which the substeps are swept."""
+
+T = TypeVar("T")
+
+
+def add_command(commands: Any) -> None:
+    """Add the command to those of a parser."""
+    parser = commands.add_parser(
+        "accuracy",
+        help="measure what accuracy costs, for every setting",
+        description="Measures error, time and memory of solvers, iterations, substeps, time "
+        "steps, points and dtypes on a perm that springs off its rod, for the final shape and for "
+        "a reverse-mode gradient, against a fine reference whose own error is bounded. Writes "
+        "work-precision diagrams (accuracy.png), their numbers (accuracy.csv, accuracy.json) and "
+        "how the paper's solver stretches a hanging strand (theory.png, stretch.csv), and prints "
+        "the cheapest settings for some errors. Nothing else should run meanwhile. Ctrl-C "
+        "keeps what was measured.",
+        epilog="example: python -m jaxhair accuracy --quick --output accuracy. In Python, "
+        'jaxhair.cheapest(0.01, table="accuracy/accuracy.csv") gives the settings for 1 %%.',
+    )
+    parser.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
+    parser.add_argument("--quick", action="store_true", help="a few settings, coarser reference")
+    parser.add_argument("--strands", type=int, default=64, help="that are timed together (64)")
+    parser.add_argument("--overwrite", action="store_true", help="replace files in DIR")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command; returns 0, or 130 if it was interrupted."""
+    from jaxhair.figures import optional
+
+    check.whole("--strands", options.strands, least=1)
+    plan = grid.plan(strands=options.strands, quick=options.quick)
+    optional("matplotlib")
+    folder = Path(options.output)
+    for path in (folder / name for name in FILES):
+        if not options.overwrite and os.path.lexists(path):
+            raise FileExistsError(
+                f"{path} exists: --output must be another folder, or add --overwrite"
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        check_new(folder / name, overwrite=options.overwrite)
+    results = _measured(plan, progress=not options.quiet)
+    if results.reference is None or not results.rows:
+        print("interrupted: nothing was measured yet", file=sys.stderr)
+        return 130
+    written = _write(plan, results, folder, overwrite=options.overwrite)
+    print(_report(plan, results))
+    print("wrote " + ", ".join(str(path) for path in written))
+    if not results.complete:
+        kept = f"{len(results.rows)} of {len(plan.settings)} settings"
+        print(f"interrupted: {kept} are kept", file=sys.stderr)
+    return 0 if results.complete else 130
+
+
+@dataclass
+class Results:
+    """What has been measured so far."""
+
+    reference: Reference | None = None
+    rows: list[Row] = field(default_factory=list)
+    stretches: list[Stretch] = field(default_factory=list)
+    complete: bool = False
+
+
+def _measured(plan: Plan, *, progress: bool) -> Results:
+    """All that is planned, or, after Ctrl-C, what was measured before it."""
+    results = Results()
+    wanted = {(n, 1): None for n in plan.iterations}
+    wanted |= {(BASE_ITERATIONS, m): None for m in plan.substeps}
+    try:
+        if progress:
+            print("Computing the reference.", file=sys.stderr, flush=True)
+        results.reference = reference(
+            plan.problem,
+            points=plan.points,
+            steps_per_second=plan.steps_per_second,
+            levels=plan.levels,
+        )
+        if progress:
+            print(results.reference, file=sys.stderr, flush=True)
+        for setting in _shown(plan.settings, "measuring", progress):
+            results.rows.append(measure(plan.problem, results.reference, setting))
+        for iterations, substeps in _shown(
+            list(wanted), "iterations and substeps of a hanging strand", progress
+        ):
+            results.stretches.append(stretch(iterations, substeps))
+    except KeyboardInterrupt:
+        return results
+    results.complete = True
+    return results
+
+
+def _shown(items: Sequence[T], title: str, progress: bool) -> Iterator[T]:
+    """The items, with a progress bar that names the present one."""
+    if not progress:
+        yield from items
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=len(items), desc=title, unit="setting") as bar:
+        for item in items:
+            bar.set_postfix_str(str(item))
+            yield item
+            bar.update()
+
+
+def _write(plan: Plan, results: Results, folder: Path, *, overwrite: bool) -> list[Path]:
+    """The files' paths."""
+    from jaxhair.accuracy import figures
+
+    assert results.reference is not None
+    paths = {name: folder / name for name in FILES}
+    table.write(paths["accuracy.csv"], results.rows, overwrite=overwrite)
+    table.write_json(paths["accuracy.json"], description(plan, results), overwrite=overwrite)
+    figures.accuracy(
+        paths["accuracy.png"], results.rows, plan.problem, results.reference, overwrite=overwrite
+    )
+    if results.stretches:
+        with (
+            new_file(paths["stretch.csv"], overwrite=overwrite) as temporary,
+            temporary.open("w", encoding="utf-8", newline="") as file,
+        ):
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(("iterations", "substeps", "stretch_relative", "theory_relative"))
+            for s in results.stretches:
+                writer.writerow((s.iterations, s.substeps, f"{s.measured:.6g}", f"{s.theory:.6g}"))
+        figures.theory(paths["theory.png"], results.stretches, overwrite=overwrite)
+    else:
+        del paths["stretch.csv"], paths["theory.png"]
+    return list(paths.values())
+
+
+def description(plan: Plan, results: Results) -> dict[str, Any]:
+    """What the table was measured on and against, for accuracy.json."""
+    found, problem = results.reference, plan.problem
+    assert found is not None
+    return {
+        "problem": {
+            "what": "hair wound on a rod, permed there and released under gravity",
+            "strands": problem.strands,
+            "length_m": problem.length,
+            "rod_diameter_m": problem.rod_diameter,
+            "seconds": problem.seconds,
+        },
+        "reference": {
+            "what": str(found),
+            "bound_relative_to_length": found.bound,
+            "gradient_bound_relative": found.gradient_bound,
+            "points": found.points,
+            "steps_per_second": found.steps_per_second,
+            "levels": found.levels,
+            "seconds": found.seconds,
+            "shape_m": found.shape.tolist(),
+            "gradient": dict(zip(PARAMETERS, found.gradient.tolist(), strict=True)),
+        },
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "complete": results.complete,
+    }
+
+
+def _report(plan: Plan, results: Results) -> str:
+    """The cheapest settings for some errors."""
+    rows, found = results.rows, results.reference
+    failed = sum(not row.forward.ok for row in rows)
+    lines = [
+        f"{found}",
+        f"{len(rows)} settings, of which {failed} failed; {plan.problem.strands} strands; "
+        f"{os.cpu_count()} cores, jax {jax.__version__}",
+        "",
+        "Cheapest for the shape (error over the length, wall seconds per simulated second)",
+        table.recommended(rows, gradient=False),
+    ]
+    if any(row.gradient is not None for row in rows):
+        lines += [
+            "",
+            "Cheapest for the gradient (error over its norm)",
+            table.recommended(rows, gradient=True),
+        ]
+    return "\n".join(lines)
