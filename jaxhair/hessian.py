@@ -11,6 +11,7 @@ At rest they change nothing, and in motion what a smaller time step changes too.
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxhair import quaternion as quat
@@ -71,7 +72,7 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
         spring = spring * (1 + rate)
     weakest = jnp.min(spring, axis=1, keepdims=True)
     bent = jnp.where(weakest > 0, quat.dot(moment, moment) / jnp.where(weakest > 0, weakest, 1), 0)
-    rounding = 32 * jnp.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)
+    rounding = 32 * np.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)
     cover = bent / 4 + quat.safe_norm(moment) * quat.safe_norm(r[:, 1:]) + rounding
     return Joints(r, spring, moment, cover)
 
