@@ -143,7 +143,8 @@ class Compliant(_Sweeping):
     Each constraint has a multiplier, which grows to its force over the iterations
     (Macklin, Mueller and Chentanez, XPBD, 2016; DOI 10.1145/2994258.2994272):
     d lambda = -(C + alpha lambda) / (sum w |grad C|^2 + alpha), alpha = compliance / dt^2.
-    Converged, its result does not depend on iterations; it converges as slowly as the paper's.
+    It converges as slowly as the paper's. Converged, the shape at rest does not depend on the
+    iterations any more; on dt it does, in the first order, because frames turn on the way.
 
     Arguments: those of `PositionBased`.
     """

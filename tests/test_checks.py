@@ -98,6 +98,18 @@ MATERIAL: list[Case] = [
     (lambda: jh.Bonds(influence=None), "bonds.influence|shape ()|(4,)"),
     (lambda: jh.Bonds(fraction=(1, 1, 1, 2)), "bonds.fraction|2.0 at (3,)|[0, 1]"),
     (lambda: jh.Bonds(fraction=1.0), "bonds.fraction|shape ()|(4,)"),
+    (lambda: jh.PhysicalFibre(young_modulus=0), "fibre.young_modulus|0|above 0"),
+    (lambda: jh.PhysicalFibre(shear_modulus=-1.0), "fibre.shear_modulus|-1.0|above 0"),
+    (lambda: jh.PhysicalFibre(radius="thick"), f"fibre.radius|'thick'|{NUMBER}"),
+    (lambda: jh.PhysicalFibre(minor_radius=0.0), "fibre.minor_radius|0.0|above 0"),
+    (lambda: jh.PhysicalFibre(density=NAN), "fibre.density|nan|finite"),
+    (lambda: jh.PhysicalFibre(cuticle_share=1.5), "fibre.cuticle_share|1.5|[0, 1]"),
+    (lambda: jh.PhysicalFibre(peeling_rate=-1), "fibre.peeling_rate|-1|0 or more"),
+    (lambda: jh.PhysicalFibre(damping_time=-0.1), "fibre.damping_time|-0.1|0 or more"),
+    (lambda: jh.Direct(newton_steps=0), "solver.newton_steps|0|at least 1"),
+    (lambda: jh.Direct(frame_inertia=0.0), "solver.frame_inertia|0.0|above 0"),
+    (lambda: jh.Direct(substeps=0), "solver.substeps|0|at least 1"),
+    (lambda: jh.Compliant(substeps=1.5), "solver.substeps|1.5|whole number"),  # type: ignore
     (lambda: jh.PositionBased(0), "solver.iterations|0|at least 1"),
     (lambda: jh.PositionBased(True), "solver.iterations|True|whole number"),
     (lambda: jh.PositionBased(2.5), "solver.iterations|2.5|whole number"),  # type: ignore
@@ -203,6 +215,10 @@ WRONG_KIND: list[Case] = [
     (lambda: jh.Phase("a", 1.0, None), "phase 'a'.effects|None|tuple"),  # type: ignore[arg-type]
     (lambda: jh.Scene(None), "scene.strands|None|Strands"),  # type: ignore[arg-type]
     (lambda: jh.Scene(HAIR, 0.5), "scene.fibre|0.5|Fibre"),  # type: ignore[arg-type]
+    (lambda: jh.Scene(HAIR, jh.Fibre(), solver=jh.Direct()), "scene.fibre|Direct|PhysicalFibre"),
+    (lambda: jh.Scene(HAIR, jh.PhysicalFibre(radius=[1e-4] * 3)), "fibre.radius|(3,)|(2,)"),
+    (lambda: one(jh.TipForce((0, 0, -1e-6))), "phase 'only'|TipForce|PhysicalFibre"),
+    (lambda: jh.TipForce((0, 0)), "TipForce.force|(2,)|(3,)"),
     (lambda: jh.Scene(HAIR, bonds=(1, 1, 1, 1)), "scene.bonds|Bonds"),  # type: ignore[arg-type]
     (lambda: jh.Scene(HAIR, solver="fast"), "scene.solver|'fast'"),  # type: ignore[arg-type]
     (lambda: jh.Scene(HAIR, phases=jh.Phase("a", 1)), "scene.phases|tuple"),  # type: ignore

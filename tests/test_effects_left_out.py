@@ -26,6 +26,7 @@ AXIS, SPIN = (0.0, 1.0, 0.0), (1.0, 2.0, 3.0)
 EFFECTS: dict[str, Any] = {
     "Gravity": jh.Gravity(),
     "Drag": jh.Drag(0.3),
+    "TipForce": jh.TipForce((0.0, 0.0, -1e-6)),
     "Wind": jh.Wind((0, 0, 0), (1, 0, 0), 9.0),
     "DryingWind": jh.DryingWind((0, 0, 0), (1, 0, 0), 9.0),
     "HairContact": jh.HairContact(),
@@ -43,7 +44,7 @@ EFFECTS: dict[str, Any] = {
 
 def scene_of(**phases: tuple) -> jh.Scene:
     steps = tuple(jh.Phase(name, 0.1, effects) for name, effects in phases.items())
-    return jh.Scene(HAIR, bonds=WET, phases=steps)
+    return jh.Scene(HAIR, jh.PhysicalFibre(), WET, steps)
 
 
 def lowered(scene: jh.Scene, phase: str) -> str:

@@ -43,6 +43,9 @@ COLUMNS = (*SETTING_COLUMNS, *COST_COLUMNS, *(f"gradient_{name}" for name in COS
 WANTED = (0.1, 0.03, 0.01, 0.003, 0.001)
 """Errors for which the command prints the cheapest settings."""
 
+WANTED_OF_GRADIENTS = (0.3, 0.1, 0.05, 0.02)
+"""The same for errors of gradients, which are larger."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -162,7 +165,7 @@ def recommended(rows: Sequence[Row], *, gradient: bool) -> str:
     """The cheapest settings for each error of `WANTED`, as an aligned table."""
     head = ("wanted", "reached", "solver", "points", "steps/s", "dtype", "s per s", "memory")
     lines: list[tuple[str, ...]] = [head]
-    for error in WANTED:
+    for error in WANTED_OF_GRADIENTS if gradient else WANTED:
         row = best(rows, error, gradient=gradient)
         cost = None if row is None else row.cost(gradient)
         if row is None or cost is None:
