@@ -31,9 +31,8 @@ class Direct(Solver):
     leaves an error of second order in the rotation that is left; at rest none. Rotational inertia,
     a 10^-4th of the rest in a hair, is left out but for `frame_inertia`.
     After Deul, Kugelstadt, Weiler and Bender, Direct Position-Based Solver for Stiff Rods, 2018
-    (DOI 10.1111/cgf.13326), with forces as unknowns in place of all multipliers, and with the
-    second derivative of a tension's direction, without which light strands under much tension
-    would be unstable.
+    (DOI 10.1111/cgf.13326), with forces as unknowns in place of all multipliers, and with second
+    derivatives of the energy (see `jaxhair.hessian`).
 
     Arguments:
         newton_steps: in each step.

@@ -61,15 +61,10 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
     """
     shape, share = rest
     spring = share * rod.bending() / (unit.force * unit.length)
+    spring, shape = rods.damped(rod, spring, shape, before, dt)
     r = rods.darboux(q[:-1], q[1:])
     r = quat.same_hemisphere(r, shape) * r
     moment = spring * (r - shape)[:, 1:]
-    if rod.material is not None and rod.material.damping_time is not None:
-        rate = rod.material.damping_time / dt
-        old = rods.darboux(before[:-1], before[1:])
-        old = quat.same_hemisphere(old, r) * old
-        moment = moment + spring * rate * (r - old)[:, 1:]
-        spring = spring * (1 + rate)
     weakest = jnp.min(spring, axis=1, keepdims=True)
     bent = jnp.where(weakest > 0, quat.dot(moment, moment) / jnp.where(weakest > 0, weakest, 1), 0)
     rounding = 32 * np.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)

@@ -178,6 +178,26 @@ def darboux(q1: Array, q2: Array) -> Array:
     return quat.relative(q1, q2)
 
 
+def damped(rod: Rod, spring: Array, shape: Array, before: Array, dt: Any) -> tuple[Array, Array]:
+    """The moment spring (Omega - shape) + spring (T / dt) (Omega - Omega_before) as one spring.
+
+    Its constant is spring (1 + T / dt), and its shape what lies between both in those parts.
+    Without a damping time T, spring and shape as they are. Needs a material.
+
+    Arguments:
+        spring: shape (points - 2, 3, strands or 1). shape: unit quaternions, (points - 2, 4, ...).
+        before: orientations at the start of the step, shape (points - 1, 4, strands).
+    """
+    time = None if rod.material is None else rod.material.damping_time
+    if time is None:
+        return spring, shape
+    rate = time / dt
+    old = darboux(before[:-1], before[1:])
+    old = quat.same_hemisphere(old, shape) * old
+    between = (shape + rate * old)[:, 1:] / (1 + rate)
+    return spring * (1 + rate), quat.from_vector_part(between)
+
+
 def bend_twist_violation(r: Array, rest: Array) -> Array:
     """C_b = Omega - s Omega_o (Eq. 6), with s = +1 or -1, whichever is nearer (Eq. 7, Eq. 11).
 

@@ -82,6 +82,12 @@ class Scene:
                 f"scene.fibre is a Fibre, whose k has no unit; with {type(self.solver).__name__} "
                 "it must be a PhysicalFibre"
             )
+        damping = getattr(self.fibre, "damping_time", None)
+        if not self.solver.compliant and damping is not None:
+            raise ValueError(
+                f"fibre.damping_time is {damping!r}; with {type(self.solver).__name__}, which "
+                "does not compute it, it must be None"
+            )
         if not isinstance(self.fibre, PhysicalFibre):
             check.instance("scene.fibre", self.fibre, Fibre)
         object.__setattr__(self, "phases", check.several("scene.phases", self.phases, Phase))

@@ -159,6 +159,7 @@ class Compliant(_Sweeping):
         length, wq = self._weights(rod)
         shape, share = rest
         spring = share * _relative_springs(rod, dt)
+        spring, shape = rods.damped(rod, spring, shape, state.orientations, dt)
         # alpha of stretch and shear, 1 / (E A l) in the units of the weights
         unit_mass = rod.unit_mass()
         assert rod.material is not None

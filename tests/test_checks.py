@@ -218,6 +218,7 @@ WRONG_KIND: list[Case] = [
     (lambda: jh.Scene(HAIR, jh.Fibre(), solver=jh.Direct()), "scene.fibre|Direct|PhysicalFibre"),
     (lambda: jh.Scene(HAIR, jh.PhysicalFibre(radius=[1e-4] * 3)), "fibre.radius|(3,)|(2,)"),
     (lambda: one(jh.TipForce((0, 0, -1e-6))), "phase 'only'|TipForce|PhysicalFibre"),
+    (lambda: jh.Scene(HAIR, jh.PhysicalFibre(damping_time=0.1)), "damping_time|0.1|PositionBased"),
     (lambda: jh.TipForce((0, 0)), "TipForce.force|(2,)|(3,)"),
     (lambda: jh.Scene(HAIR, bonds=(1, 1, 1, 1)), "scene.bonds|Bonds"),  # type: ignore[arg-type]
     (lambda: jh.Scene(HAIR, solver="fast"), "scene.solver|'fast'"),  # type: ignore[arg-type]

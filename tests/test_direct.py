@@ -146,7 +146,7 @@ def test_the_matrix_bounds_the_true_second_derivative() -> None:
         assert np.linalg.eigvalsh(matrix - true).min() > -2e-3 * scale
 
 
-def released(numbers: dict[str, Any], solver: jh.Direct, steps: int = 100) -> jax.Array:
+def released(numbers: dict[str, Any], solver: Any, steps: int = 100) -> jax.Array:
     """Final points of two strands that were permed, cut to a part and released into wind."""
     hair = jh.Strands.straight(
         [[0.0, 0, 0], [0, 0.01, 0]], (0.0, 0.1, -1.0), length=0.12, points=13, dtype="float64"
@@ -176,8 +176,10 @@ NUMBERS: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("solver", [jh.Direct(), jh.Direct(newton_steps=2, substeps=2)])
-def test_gradients_agree_with_central_differences_and_between_modes(solver: jh.Direct) -> None:
+@pytest.mark.parametrize(
+    "solver", [jh.Direct(), jh.Direct(newton_steps=2, substeps=2), jh.Compliant(iterations=3)]
+)
+def test_gradients_agree_with_central_differences_and_between_modes(solver: Any) -> None:
     start = {name: jnp.asarray(value) for name, value in NUMBERS.items()}
 
     @jax.jit
@@ -300,3 +302,27 @@ def test_pull_matrix_is_the_positive_part() -> None:
         np.testing.assert_allclose(found[i], wanted, atol=1e-12)
     slope = jax.jacrev(lambda n: hessian.pull_matrix(hessian.pulls(n, *eye)))(jnp.zeros((6, 3, 1)))
     assert np.all(np.isfinite(slope))
+
+
+def test_vmap_over_whole_scenes() -> None:
+    """Two moduli at once as one after the other."""
+    moduli = jnp.asarray([3e9, 5e9])
+
+    def end(young: Any) -> jax.Array:
+        return released({**NUMBERS, "young_modulus": young}, jh.Direct(), steps=20)
+
+    together = jax.jit(jax.vmap(end))(moduli)
+    for i in range(2):
+        np.testing.assert_allclose(together[i], end(moduli[i]), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", jh.scenes.SCENES)
+def test_the_papers_scenes_with_the_direct_solver(name: str) -> None:
+    """Contact, obstacles, wind and winding, real hair's stiffness, float32: hair stays hair."""
+    scene = jh.scenes.by_name(name, strands=8, solver=jh.Direct())
+    assert isinstance(scene.fibre, jh.PhysicalFibre)
+    movie = jh.simulate(scene, fps=10)
+    edges = np.linalg.norm(np.diff(movie.positions, axis=2), axis=-1)
+    length = np.asarray(scene.strands.lengths)[None]
+    assert np.abs(edges.sum(-1) / length.sum(-1) - 1).max() < 0.05
+    assert np.abs(edges[-1] / length[0] - 1).max() < 1e-2
