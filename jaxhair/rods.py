@@ -71,7 +71,7 @@ class Rod:
 
     def point_lengths(self) -> Array:
         """Length of rod that belongs to each point [m]: half of each edge beside it."""
-        none = jnp.zeros_like(self.lengths[:1])
+        none = jnp.zeros((1, *self.lengths.shape[1:]), self.lengths.dtype)
         return (jnp.concatenate([none, self.lengths]) + jnp.concatenate([self.lengths, none])) / 2
 
     def unit_mass(self) -> Array:
