@@ -175,7 +175,10 @@ def test_what_the_command_measures(quick: bool) -> None:
     plan = grid.plan(strands=3, quick=quick)
     assert plan.problem.strands == 3
     assert len({str(s) for s in plan.settings}) == len(plan.settings)
-    assert {type(s.solver) for s in plan.settings if s.gradient} == set(grid.SOLVERS.values())
+    # --quick leaves the gradient of one solver out: each is compiled for long.
+    left_out = {jh.Compliant} if quick else set()
+    with_gradient = {type(s.solver) for s in plan.settings if s.gradient}
+    assert with_gradient == set(grid.SOLVERS.values()) - left_out
     for s in plan.settings:
         assert s.turned in grid.TURNED
         assert (s.points - 1) % 8 == 0

@@ -273,3 +273,14 @@ def test_values_and_gradients_at_zero(dtype: str, mode: object) -> None:
     np.testing.assert_allclose(np.asarray(slopes[0])[0, 1, :, 1], u, atol=tolerance)
     across = (np.eye(3) - np.outer(u, u)) / 5
     np.testing.assert_allclose(np.asarray(slopes[1])[:, 1, :, 1], across, atol=tolerance)
+
+
+def test_rotation_vectors_have_second_derivatives_at_zero() -> None:
+    """cos(|v| / 2) is 1 - |v|^2 / 8: a norm guarded at 0 would give 0 in place of -1/4."""
+    real = jax.jit(jax.hessian(lambda v: quat.from_rotation_vector(v[:, None])[0, 0]))
+    np.testing.assert_allclose(real(jnp.zeros(3)), -np.eye(3) / 4, atol=1e-15)
+    axis = np.array([0.6, 0.0, 0.8])
+    for size in (0.0, 1e-9, 0.19, 0.2, 0.21, 3.0):  # the series ends at 0.2
+        found = np.asarray(quat.from_rotation_vector(jnp.asarray(size * axis)[:, None]))[:, 0]
+        wanted = np.append(np.cos(size / 2), axis * np.sin(size / 2))
+        np.testing.assert_allclose(found, wanted, atol=1e-15)
