@@ -49,17 +49,6 @@ Pair = tuple[Array, Array]
 """What belongs to forces and what to rotations, each of shape (edges, 3, strands)."""
 
 
-def product(blocks: Blocks, x: Pair) -> Pair:
-    """The matrix times x."""
-    n, phi = x
-    above = -blocks.compliance * n + _mv(blocks.coupling, phi)
-    below = _tv(blocks.coupling, n) + _mv(blocks.stiffness, phi)
-    t, s = blocks.next_compliance, blocks.next_stiffness
-    above = above.at[:-1].add(t * n[1:]).at[1:].add(t * n[:-1])
-    below = below.at[:-1].add(-_mv(s, phi[1:])).at[1:].add(-_tv(s, phi[:-1]))
-    return above, below
-
-
 def solve(blocks: Blocks, right: Pair) -> tuple[Pair, "Factors"]:
     """x with blocks x = right, and the factors, which `solve_again` uses."""
     factors, reduced = _eliminated(blocks, right)
@@ -102,13 +91,13 @@ def _eliminated(blocks: Blocks, right: Pair) -> tuple[Factors, Pair]:
         compliance, c, k, n, phi = reduced
         t, s, (next_compliance, next_c, next_k, next_n, next_phi) = at
         inverse_compliance = _inverse(compliance)
-        g = _mm(inverse_compliance, c)
+        g = matrix_product(inverse_compliance, c)
         inverse = _inverse(k + _tm(c, g))
-        g_inverse, inverse_s = _mm(g, inverse), _mm(inverse, s)
+        g_inverse, inverse_s = matrix_product(g, inverse), matrix_product(inverse, s)
         n, phi = _block(inverse_compliance, g, inverse, n, phi)
         after = (
             next_compliance - t * t * (inverse_compliance - _mt(g_inverse, g)),
-            next_c + t * _mm(g_inverse, s),
+            next_c + t * matrix_product(g_inverse, s),
             next_k - _tm(s, inverse_s),
             next_n - t[0] * n,
             next_phi + _tv(s, phi),
@@ -174,7 +163,8 @@ def _inverse(a: Array) -> Array:
 # "t" is transposed.
 
 
-def _mm(a: Array, b: Array) -> Array:
+def matrix_product(a: Array, b: Array) -> Array:
+    """a b."""
     return jnp.sum(a[..., :, :, None, :] * b[..., None, :, :, :], axis=-3)
 
 

@@ -129,7 +129,7 @@ def linearised(known: Known, frame_inertia: Array, dt: Any) -> tuple[Blocks, Pai
         compliance, shared, gap = compliance + 1 - exists, shared * exists[1:], gap * exists
     blocks = Blocks(
         compliance=compliance,
-        coupling=length[:, None] * jnp.stack([d2, -d1, 0 * d1], axis=2) * may_turn,
+        coupling=length[:, None] * jnp.stack([d2, -d1, jnp.zeros_like(d1)], axis=2) * may_turn,
         stiffness=stiffness * may_turn + (1 - may_turn) * eye,
         next_compliance=shared,
         next_stiffness=between * may_turn[:-1] * may_turn[1:],

@@ -16,6 +16,7 @@ from jax import Array
 
 from jaxhair import quaternion as quat
 from jaxhair import rods
+from jaxhair.block_tridiagonal import matrix_product
 from jaxhair.rods import Rod
 
 
@@ -113,9 +114,9 @@ def joint_matrices(joints: Joints) -> tuple[Array, Array, Array]:
     a_t, spring = jnp.swapaxes(a, 1, 2), joints.spring[:, :, None]
     twisted = _matrix(jnp.zeros_like(w[:, 0]), w * joints.moment / 4)
     return (
-        _product(a, spring * a_t) + held,
-        _product(a_t, spring * a) + held,
-        _product(a, spring * a) - twisted - held,
+        matrix_product(a, spring * a_t) + held,
+        matrix_product(a_t, spring * a) + held,
+        matrix_product(a, spring * a) - twisted - held,
     )
 
 
@@ -178,10 +179,6 @@ def _matrix(w: Array, v: Array) -> Array:
     x, y, z = (v[:, i] for i in range(3))
     rows = [[w, -z, y], [z, w, -x], [-y, x, w]]
     return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
-
-
-def _product(a: Array, b: Array) -> Array:
-    return jnp.sum(a[:, :, :, None] * b[:, None], axis=2)
 
 
 def padded(x: Array, before: int, after: int) -> Array:

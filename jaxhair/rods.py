@@ -111,6 +111,13 @@ def _share(part: Array, whole: Array) -> Array:
     return jnp.where(none, 0, part / jnp.where(none, 1, whole))
 
 
+def stretch_shear_whole(
+    w1: Array, w2: Array, wq: Array, length: Array, compliance: Array | float = 0.0
+) -> Array:
+    """D = w1 + w2 + 4 wq l^2, the denominator of `stretch_shear_factors`, and the compliance."""
+    return w1 + w2 + 4 * wq * length**2 + compliance
+
+
 def stretch_shear_factors(
     w1: Array, w2: Array, wq: Array, length: Array, compliance: Array | float = 0.0
 ) -> tuple[Array, ...]:
@@ -125,7 +132,7 @@ def stretch_shear_factors(
         length: l [m].
         compliance: of a constraint that gives way, added to D.
     """
-    whole = w1 + w2 + 4 * wq * length**2 + compliance
+    whole = stretch_shear_whole(w1, w2, wq, length, compliance)
     return (
         _share(w1 * length, whole),
         _share(w2 * length, whole),

@@ -21,7 +21,7 @@ from jaxhair.effects import (
     VelocityEffect,
     of_kind,
 )
-from jaxhair.fibre import PhysicalFibre, material, stiffness
+from jaxhair.fibre import Fibre, PhysicalFibre, material, stiffness
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
@@ -127,6 +127,8 @@ def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
     k = stiffness(scene.fibre, rod.distance())
     for soft in of_kind(effects, StiffnessEffect):
         k = soft.scaled(k)
+        if isinstance(scene.fibre, Fibre):  # a share, which a traced factor could lead astray
+            k = jnp.clip(k, 0, 1)
     weights = points_free.astype(lengths.dtype)
     of_fibre = None
     if isinstance(scene.fibre, PhysicalFibre):

@@ -1,7 +1,7 @@
 """Solvers of a strand's elasticity: from predicted positions to admissible ones.
 
 Three, of one interface (`Solver`): the paper's position-based one, compliant constraints (XPBD),
-and the direct solver of `jaxhair.direct`, which is the default choice for a physical fibre.
+and the direct solver of `jaxhair.direct`, the one to choose for a physical fibre.
 """
 
 from abc import abstractmethod
@@ -165,7 +165,7 @@ class Compliant(_Sweeping):
         assert rod.material is not None
         alpha = unit_mass / (rod.material.axial_stiffness * length * dt**2)
         stretch = rods.stretch_shear_factors(w[:-1], w[1:], wq, length, alpha * length**2)
-        whole = w[:-1] + w[1:] + length**2 * (4 * wq + alpha)
+        whole = rods.stretch_shear_whole(w[:-1], w[1:], wq, length, alpha * length**2)
         if rod.ragged:
             stretch = tuple(g * rod.edge_exists().astype(length.dtype) for g in stretch)
 

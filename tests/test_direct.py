@@ -13,7 +13,7 @@ from test_oracle import random_hair
 import jaxhair as jh
 from jaxhair import direct, hessian
 from jaxhair import quaternion as quat
-from jaxhair.block_tridiagonal import Blocks, product, solve, solve_again
+from jaxhair.block_tridiagonal import Blocks, solve, solve_again
 from jaxhair.bonds import springs
 from jaxhair.hessian import Units
 from jaxhair.simulate import prepare
@@ -44,6 +44,18 @@ def system(edges: int, strands: int, dtype: str) -> tuple[Blocks, Any]:
         0.2 * normal(edges - 1, 3, 3),
     )
     return blocks, (normal(edges, 3), normal(edges, 3))
+
+
+def product(blocks: Blocks, x: Any) -> Any:
+    """The matrix times x."""
+    n, phi = x
+    above = -blocks.compliance * n + jnp.einsum("eijs,ejs->eis", blocks.coupling, phi)
+    below = jnp.einsum("ejis,ejs->eis", blocks.coupling, n)
+    below = below + jnp.einsum("eijs,ejs->eis", blocks.stiffness, phi)
+    t, s = blocks.next_compliance, blocks.next_stiffness
+    above = above.at[:-1].add(t * n[1:]).at[1:].add(t * n[:-1])
+    below = below.at[:-1].add(-jnp.einsum("eijs,ejs->eis", s, phi[1:]))
+    return above, below.at[1:].add(-jnp.einsum("ejis,ejs->eis", s, phi[:-1]))
 
 
 def dense(blocks: Blocks, strand: int) -> np.ndarray:
