@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -11,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.targets import Helix, Target
-from jaxhair import Bonds, Drag, Hold, Phase, Scene, Strands, treatments
+from jaxhair import Bonds, Drag, Hold, Phase, Scene, Strands, check, treatments
+from jaxhair.arrays import contents, reason
 
 FREE = (Hold(), Drag(0.1))
 """Curls are compared without weight: only their diameters were measured."""
@@ -21,7 +23,11 @@ CLIMB = 0.15
 
 BRIEF: dict[str, Any] = {"seconds": 0.25, "free": FREE}
 
-TREATMENTS = ("water set", "acid set", "perm")
+TREATMENTS: dict[Any, Callable[..., tuple[Phase, ...]]] = {
+    "water set": treatments.water_set,
+    "acid set": treatments.acid_set,
+    "perm": treatments.perm,
+}
 FILE_KEYS = {"title", "hair", "state"}
 HAIR_KEYS = {"natural_curl_diameter", "rod_diameter", "length", "points"}
 STATE_KEYS = {
@@ -53,37 +59,46 @@ def packaged() -> Measured:
 
 def read(path: str | Path) -> Measured:
     """The curls of a file of the same form. Raises ValueError for a wrong or missing entry."""
+    file = check.path("path", path)
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = contents(file).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not TOML: {error}") from error
-    return from_text(text, name=str(path))
+        raise ValueError(f"{file} is not TOML: {error}") from error
+    return from_text(text, name=str(file))
 
 
 def from_text(text: str, *, name: str) -> Measured:
     """As `read`, from the file's text; `name` stands in error messages."""
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{name} is not TOML: {error}") from error
+    except (ValueError, RecursionError) as error:  # of numbers and lists too large for Python, too
+        raise ValueError(f"{name} is not TOML: {reason(error)}") from error
+    try:
+        return _measured(table, name)
+    except ValueError as error:
+        raise ValueError(f"{name}, {error}") from error
+
+
+def _measured(table: dict[str, Any], name: str) -> Measured:
     hair = table.get("hair")
     states = table.get("state")
     if not isinstance(hair, dict) or not isinstance(states, list) or not states:
-        raise ValueError(f"{name} must have a table [hair] and one or more [[state]]")
-    _check_keys(table, FILE_KEYS, name)
-    _check_keys(hair, HAIR_KEYS, f"{name}, hair")
-    rod = _number(hair, "rod_diameter", f"{name}, hair")
-    length = _number(hair, "length", f"{name}, hair")
+        raise ValueError("content: it must have a table [hair] and one or more [[state]]")
+    _check_keys(table, FILE_KEYS, "content")
+    _check_keys(hair, HAIR_KEYS, "hair")
+    title = table.get("title", name)
+    check.instance("title", title, str)
+    rod = _number(hair, "rod_diameter", "hair")
+    length = _number(hair, "length", "hair")
     points = hair.get("points", 25)
-    if not isinstance(points, int) or not 3 <= points <= 1000:
-        raise ValueError(f"{name}, hair: points is {points!r}; it must be in [3, 1000]")
+    check.whole("hair: points", points, least=3, most=1000)
     natural = 0.0  # as all curls here, by the inverse of its diameter [1/m]
     if "natural_curl_diameter" in hair:
-        natural = 1 / _number(hair, "natural_curl_diameter", f"{name}, hair")
+        natural = 1 / _number(hair, "natural_curl_diameter", "hair")
     phases: list[Phase] = []
     targets: dict[str, Target] = {}
     for number, state in enumerate(states):
-        where = f"{name}, state {number + 1}"
+        where = f"state {number + 1}"
         label, made = _phases(state, rod, where)
         if label in targets:
             raise ValueError(f"{where}: name is {label!r} again; names must differ")
@@ -95,8 +110,8 @@ def from_text(text: str, *, name: str) -> Measured:
     try:
         scene = Scene(curly(length, points, natural), bonds=equal, phases=tuple(phases))
     except ValueError as error:
-        raise ValueError(f"{name}, hair: {error}") from error
-    return Measured(str(table.get("title", name)), scene, targets)
+        raise ValueError(f"hair: {error}") from error
+    return Measured(title, scene, targets)
 
 
 def curly(length: float, points: int, inverse_diameter: float) -> Strands:
@@ -114,21 +129,14 @@ def curly(length: float, points: int, inverse_diameter: float) -> Strands:
 def _phases(state: Any, rod: float, where: str) -> tuple[str, list[Phase]]:
     """The state's name and the phases that lead to it, on the hair as it is then."""
     if not isinstance(state, dict):
-        raise ValueError(f"{where}: it is {state!r}; it must be a table")
+        raise ValueError(f"{where}: it is {check.short(state)}; it must be a table")
     _check_keys(state, STATE_KEYS, where)
-    name, treatment = state.get("name"), state.get("treatment")
+    name, treatment = state.get("name", ""), state.get("treatment")
     washed = state.get("after_wash", False)
-    if not isinstance(name, str) or not name or "." in name:
-        raise ValueError(f"{where}: name is {name!r}; it must be a text without '.'")
-    if treatment not in TREATMENTS:
-        raise ValueError(f"{where}: treatment is {treatment!r}; it must be one of {TREATMENTS}")
-    make = {
-        "water set": treatments.water_set,
-        "acid set": treatments.acid_set,
-        "perm": treatments.perm,
-    }[treatment]
-    if not isinstance(washed, bool):
-        raise ValueError(f"{where}: after_wash is {washed!r}; it must be true or false")
+    check.text(f"{where}: name", name)
+    check.choice(f"{where}: treatment", treatment, tuple(TREATMENTS))
+    make = TREATMENTS[treatment]
+    check.flag(f"{where}: after_wash", washed)
     label = f"{name}, before" if washed else name
     phases = list(make(name=label, rod_diameter=rod, climb=CLIMB, **BRIEF))
     if washed:
@@ -149,11 +157,9 @@ def _inverse_diameter(state: dict[str, Any], rod: float, natural: float, where: 
 
 def _check_keys(table: dict[str, Any], known: set[str], where: str) -> None:
     if unknown := set(table) - known:
-        raise ValueError(f"{where}: {sorted(unknown)[0]!r} is unknown; known are {sorted(known)}")
+        shown = check.short(sorted(unknown)[0])
+        raise ValueError(f"{where}: {shown} is unknown; known are {check.listed(sorted(known))}")
 
 
 def _number(table: dict[str, Any], key: str, where: str) -> float:
-    value = table.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < math.inf:
-        raise ValueError(f"{where}: {key} is {value!r}; it must be a number above 0")
-    return float(value)
+    return check.constant(f"{where}: {key}", table.get(key))

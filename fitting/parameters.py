@@ -35,7 +35,7 @@ class Simplex(Constraint):
 
     def free(self, value: np.ndarray) -> np.ndarray:
         if value.ndim != 1 or np.any(value < 0) or value.sum() <= 0:
-            raise ValueError(f"value is {value.tolist()}; it must be a list of numbers >= 0")
+            raise ValueError(f"value is {check.short(value)}; it must be a list of numbers >= 0")
         positive = np.maximum(value, 1e-6 * value.sum())
         return np.log(positive[:-1] / positive[-1])
 
@@ -49,7 +49,7 @@ class Positive(Constraint):
 
     def free(self, value: np.ndarray) -> np.ndarray:
         if np.any(value <= 0):
-            raise ValueError(f"value is {value.tolist()}; it must be above 0")
+            raise ValueError(f"value is {check.short(value)}; it must be above 0")
         return np.log(value.ravel())
 
     def value(self, free: Array, start: np.ndarray) -> Array:
@@ -64,14 +64,16 @@ class Interval(Constraint):
     high: float
 
     def __post_init__(self) -> None:
-        check.number("low", self.low)
-        check.number("high", self.high)
+        for name in ("low", "high"):
+            check.number(name, getattr(self, name))
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not self.low < self.high:
             raise ValueError(f"high is {self.high}; it must be above low, {self.low}")
 
     def free(self, value: np.ndarray) -> np.ndarray:
         if np.any((value < self.low) | (value > self.high)):
-            raise ValueError(f"value is {value.tolist()}; it must be in [{self.low}, {self.high}]")
+            wanted = f"it must be in [{self.low}, {self.high}]"
+            raise ValueError(f"value is {check.short(value)}; {wanted}")
         share = np.clip((value.ravel() - self.low) / (self.high - self.low), 1e-6, 1 - 1e-6)
         return np.log(share / (1 - share))
 
@@ -115,6 +117,8 @@ class Parameters:
     """
 
     def __init__(self, scene: Scene, free: Mapping[str, Constraint]) -> None:
+        check.instance("scene", scene, Scene)
+        check.instance("free", free, Mapping)
         if not free:
             raise ValueError("free is empty; it must name at least one leaf of the scene")
         leaves = named_leaves(scene)
@@ -123,20 +127,23 @@ class Parameters:
         self.leaves: dict[str, list[str]] = {}
         self.start: dict[str, np.ndarray] = {}
         for name, constraint in free.items():
+            shown = check.short(name)
             if not isinstance(constraint, Constraint):
-                raise ValueError(f"free[{name!r}] is {constraint!r}; it must be a constraint")
-            matches = [leaf for leaf in leaves if leaf == name or fnmatchcase(leaf, name)]
+                wanted = "it must be a constraint"
+                raise ValueError(f"free[{shown}] is {check.short(constraint)}; {wanted}")
+            matches = [leaf for leaf in leaves if isinstance(name, str) and fnmatchcase(leaf, name)]
+            if name in leaves:
+                matches = [name]
             if not matches:
-                listed = ", ".join(leaves)
-                raise ValueError(f"free names {name!r}; it must be one of {listed}")
+                raise ValueError(f"free names {shown}; it must be one of {check.listed(leaves)}")
             values = [np.asarray(leaves[leaf], float) for leaf in matches]
             if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
-                raise ValueError(f"free names {name!r}, whose leaves start with different values")
+                raise ValueError(f"free names {shown}, whose leaves start with different values")
             self.leaves[name], self.start[name] = matches, values[0]
             try:
                 constraint.free(values[0])
             except ValueError as error:
-                raise ValueError(f"free names {name!r}, whose {error}") from error
+                raise ValueError(f"free names {shown}, whose {error}") from error
 
     def packed(self) -> Array:
         """The free numbers to start from, shape (n,), in the scene's dtype."""

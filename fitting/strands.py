@@ -44,12 +44,16 @@ def from_strands(
     Raises ValueError for an unknown state, files that differ in their number of strands, strands
     with fewer than 3 points or curls that a rod of the given diameter cannot give.
     """
+    check.instance("observed", observed, Mapping)
     if not observed:
         raise ValueError("observed is empty; it must have at least one state")
     check.whole("strands", strands, least=1)
+    check.flag("weight", weight)
     sizes = {}
     for state, curves in observed.items():
         check.choice("state", state, STATES)
+        check.instance(f"observed[{state!r}]", curves, Curves)
+        check.finite(f"observed[{state!r}].points", curves.points)
         sizes[state] = len(curves.counts)
         if sizes[state] == 0:
             raise ValueError(f"state {state!r} has no strand; it must have one or more")
@@ -64,7 +68,9 @@ def from_strands(
     used = np.unique(np.linspace(0, total - 1, min(strands, total)).round().astype(int))
     for state, curves in observed.items():
         for i in used:
-            if _length(curves.points[i]) == 0:  # what stands behind the last point repeats it
+            if (
+                _length(curves.points[i]) < check.SMALLEST
+            ):  # what stands behind the last point repeats it
                 raise ValueError(f"state {state!r}: strand {i} has length 0; it must be above 0")
     first = next(iter(observed.values()))
     lengths = np.array([_length(first.points[i, : first.counts[i]]) for i in used])
@@ -79,7 +85,7 @@ def from_strands(
         )
     if points is None:
         points = int(np.clip(EDGES_PER_ROD * lengths.max() / rod_diameter + 1, 9, 129))
-    check.whole("points", points, least=3)
+    check.whole("points", points, least=3, most=100_000)
     free = treatments.HANGING if weight else FREE
     phases: list[Phase] = []
     for state in sorted(observed, key=("water set", "acid set", "permed", "washed").index):
@@ -140,7 +146,7 @@ def curl_shape(curves: Curves, used: np.ndarray) -> tuple[float, float]:
     for i in used:
         x = curves.points[i, : curves.counts[i]]
         x = x[:: -(-len(x) // 65)]  # points as they are: those put between would bend less
-        x = x[np.append(True, np.any(x[1:] != x[:-1], axis=1))]
+        x = x[np.append(True, np.linalg.norm(np.diff(x, axis=0), axis=1) > check.SMALLEST)]
         size = np.linalg.norm(np.diff(x, axis=0), axis=1)
         t = np.diff(x, axis=0) / size[:, None]
         across = np.cross(t[:-1], t[1:])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxhair import State, check, pytree
+from jaxhair import Curves, State, check, pytree
 from jaxhair.pytree import static
 from jaxhair.strands import strands_last
 
@@ -61,6 +61,7 @@ class Helix(Target):
         if self.length is not None:
             check.positive("helix.length", self.length)
         check.choice("helix.handedness", self.handedness, ("right", "left"))
+        check.flag("helix.align", self.align)
 
     def points(self, lengths: Array, strands: int) -> Array:
         """Points on the helix, apart by the rest lengths measured straight, as a strand's are.
@@ -99,6 +100,7 @@ class Shape(Target):
     def __post_init__(self) -> None:
         check.shape("target.strands", self.strands, ("strands", "points", 3))
         check.finite("target.strands", self.strands)
+        check.flag("target.align", self.align)
 
     def points(self, lengths: Array, strands: int) -> Array:
         """The given points."""
@@ -114,11 +116,13 @@ def resampled(points: Any, counts: Any, size: int) -> np.ndarray:
         points: [m], shape (strands, points, 3). counts: of each strand's points, shape (strands,).
     Returns shape (strands, size, 3). Raises ValueError for a strand without length.
     """
-    out = np.empty((len(points), size, 3))
-    for i, (strand, count) in enumerate(zip(np.asarray(points, float), counts, strict=True)):
-        x = strand[:count]
+    check.whole("size", size, least=2)
+    curves = Curves(points, counts)
+    check.finite("points", curves.points)
+    out = np.empty((len(curves.counts), size, 3))
+    for i, x in enumerate(curves.to_list()):
         along = np.concatenate([[0.0], np.linalg.norm(np.diff(x, axis=0), axis=1).cumsum()])
-        if along[-1] <= 0:
+        if along[-1] < check.SMALLEST:
             raise ValueError(f"strand {i} has length {along[-1]}; it must be above 0")
         wanted = np.linspace(0, along[-1], size)
         out[i] = np.stack([np.interp(wanted, along, x[:, axis]) for axis in range(3)], 1)

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxhair import check
 from jaxhair.output import new_file
 
 _DEFLATE_RATIO = 1032  # no deflate stream grows by more
+_LARGEST, _RATIO = 2**24, 100  # bytes of all arrays, and those over the file's: one may be passed
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
@@ -22,7 +24,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
     Raises ValueError naming the file and the array where the file is no .npz file, is truncated
     or damaged, or holds pickled objects, which are never loaded; OSError where it cannot be opened.
     """
-    path = Path(path)
+    path = check.path("path", path)
     data = contents(path)
     try:
         return unzip(data)
@@ -39,12 +41,14 @@ def write_arrays(
     `jaxhair.output.new_file` for what is raised where it exists or its folder does not. Raises
     ValueError where the ending is not .npz, a name is not a string or an entry is of another type.
     """
-    path = Path(path)
+    path = check.path("path", path)
     if path.suffix.lower() != ".npz":
         raise ValueError(f"{path} ends in {path.suffix!r}; arrays must go to a file ending in .npz")
     for name in arrays:
         if not isinstance(name, str) or not name or "\0" in name:
-            raise ValueError(f"an array is named {name!r}; a name must be a string, without NUL")
+            raise ValueError(
+                f"an array is named {check.short(name)}; a name must be a string, without NUL"
+            )
     checked = {name: numbers(f"array {name!r}", array, "biufcSU") for name, array in arrays.items()}
     with new_file(path, overwrite=overwrite) as temporary:
         zip_arrays(temporary, checked)
@@ -54,13 +58,15 @@ def numbers(name: str, value: Any, kinds: str) -> NDArray[Any]:
     """`value` as an array whose type is of one of NumPy's `kinds`."""
     try:
         array = np.asarray(value)
-    except ValueError as error:  # nested sequences of different lengths
-        raise ValueError(f"{name} must be an array: {error}") from None
+    except Exception as error:  # lists of different lengths, and what a foreign object raises
+        raise ValueError(f"{name} must be an array: {reason(error)}") from None
     if array.dtype.kind not in kinds:
         allowed = {"iu": "whole numbers", "fiu": "real numbers"}.get(
             kinds, "numbers, booleans or strings"
         )
-        raise ValueError(f"{name} has type {array.dtype}; it must be an array of {allowed}")
+        raise ValueError(
+            f"{name} has type {str(array.dtype)[:60]}; it must be an array of {allowed}"
+        )
     return array
 
 
@@ -73,36 +79,42 @@ def unzip(data: bytes, names: Iterable[str] | None = None) -> dict[str, NDArray[
         archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception as error:
         raise ValueError(
-            f"the file is not readable ({_reason(error)}); it must be a complete .npz file"
+            f"the file is not readable ({reason(error)}); it must be a complete .npz file"
         ) from error
     with archive:
         entries = {entry.filename: entry for entry in archive.infolist()}
         if sum(entry.compress_size for entry in archive.infolist()) > len(data):
             raise ValueError("its entries overlap; it must be a .npz file of separate arrays")
+        left = max(_LARGEST, _RATIO * len(data))
         for filename in entries if names is None else [f"{name}.npy" for name in names]:
             if filename not in entries:
                 continue
             name = filename.removesuffix(".npy")
             try:
-                arrays[name] = _unzip_array(archive, entries[filename])
+                arrays[name] = _unzip_array(archive, entries[filename], left)
+                left -= entries[filename].file_size
             except Exception as error:
                 raise ValueError(
-                    f"array {name!r} is not readable ({_reason(error)}); it must be a complete "
-                    "array of numbers, booleans or strings"
+                    f"array {check.short(name)} is not readable ({reason(error)}); it must be a "
+                    "complete array of numbers, booleans or strings"
                 ) from error
     return arrays
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
+    """An exception's text, in one line that is not long."""
     # some have no text; NumPy's goes on with advice on parameters that are not offered here
-    return str(error).partition("\n")[0] or type(error).__name__
+    text = str(error).partition("\n")[0] or type(error).__name__
+    return text if len(text) <= 150 else text[:147] + "..."
 
 
-def _unzip_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+def _unzip_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> NDArray[Any]:
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"compression {entry.compress_type}; it must be none or deflate")
     if entry.file_size > _DEFLATE_RATIO * entry.compress_size:
         raise ValueError(f"{entry.compress_size} bytes cannot hold {entry.file_size}")
+    if entry.file_size > most:
+        raise ValueError(f"{entry.file_size} bytes, where a file so small may hold {most} more")
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         if version == (1, 0):

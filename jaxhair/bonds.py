@@ -15,6 +15,9 @@ from jaxhair.pytree import pytree
 from jaxhair.rods import Rod
 from jaxhair.strands import BONDS, State
 
+TINY = float(np.finfo(np.float32).tiny)
+"""Below it a number may count as 0 in float32."""
+
 
 @pytree
 class Bonds:
@@ -34,14 +37,14 @@ class Bonds:
 
     def __post_init__(self) -> None:
         for name in ("influence", "fraction"):
-            shape = np.shape(getattr(self, name))
+            shape = check.size(f"bonds.{name}", getattr(self, name))
             if shape[-1:] != (len(BONDS),) or len(shape) > 3:
                 check.shape(f"bonds.{name}", getattr(self, name), (len(BONDS),))
-        check.not_negative("bonds.influence", self.influence)
-        check.fraction("bonds.fraction", self.fraction)
+        check.not_negative("bonds.influence", self.influence, many=True)
+        check.fraction("bonds.fraction", self.fraction, many=True)
         f = check.known(self.influence)
-        if f is not None and np.any(f.sum(axis=-1) <= 0):
-            raise ValueError(f"bonds.influence is {f.tolist()}; its sum must be above 0")
+        if f is not None and np.any(few := f.max(axis=-1, initial=0) < TINY):
+            raise ValueError(f"bonds.influence is {f[few][0].tolist()}; its sum must be above 0")
 
 
 def per_inner_point(x: Any) -> Array:

@@ -4,36 +4,71 @@ Values are looked at only where they are known: under a JAX transformation an ar
 but no value, and then only the shape is checked.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from reprlib import Repr
 from typing import Any
 
 import jax
 import numpy as np
 
+LARGEST, SMALLEST = 1e18, 1e-18
+"""Bounds of every number, and of those above 0: the squares of others do not fit into float32."""
+
+_REPR = Repr()
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 4
+_REPR.maxstring = _REPR.maxlong = _REPR.maxother = 60
+
 
 def known(value: Any) -> np.ndarray | None:
-    """`value` as a NumPy array, or None where it is traced and has no value yet."""
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    """Numbers as a float64 array, or None where they are traced and have no value yet."""
+    return None if isinstance(value, jax.core.Tracer) else np.asarray(value, float)
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
     """`value` in one short line."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(_REPR.repr(value).split())
+    except Exception:  # such as an int of too many digits
+        text = f"of class {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _numbers(name: str, value: Any) -> np.ndarray | None:
+def listed(allowed: Iterable[Any]) -> str:
+    """What is allowed, in one line that is not long."""
+    text = ", ".join(repr(a) for a in allowed)
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+NUMBERS = "a number or an array of numbers"
+
+
+def _other(name: str, value: Any, wanted: str) -> ValueError:
+    return ValueError(f"{name} is {short(value)}; it must be {wanted}")
+
+
+def numbers(name: str, value: Any, wanted: str = NUMBERS) -> np.ndarray | None:
+    """Real numbers of any value as a float64 array, or None where they are traced."""
     if isinstance(value, jax.core.Tracer):
         return None
     try:
         array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        array = np.asarray(None)
-    if array.dtype.kind not in "fiu":
-        wanted = "it must be a number or an array of numbers"
-        raise ValueError(f"{name} is {_short(value)}; {wanted}")
-    if not np.all(np.isfinite(array)):
-        raise ValueError(f"{name} has {_offender(array, ~np.isfinite(array))}; it must be finite")
+    except Exception:  # lists of different lengths, and whatever a foreign object raises
+        raise _other(name, value, wanted) from None
+    masked = isinstance(value, np.ma.MaskedArray)
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8 or masked:
+        raise _other(name, value, wanted)
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        return array.astype(float)
+
+
+def _finite(name: str, value: Any, wanted: str = NUMBERS) -> np.ndarray | None:
+    """Finite numbers as a float64 array, or None where they are traced."""
+    array = numbers(name, value, wanted)
+    if array is not None and np.any(wrong := ~(np.abs(array) <= LARGEST)):
+        wanted = f"it must be finite, and at most {LARGEST:g} in size"
+        raise ValueError(f"{name} has {_offender(array, wrong)}; {wanted}")
     return array
 
 
@@ -45,42 +80,51 @@ def _offender(array: np.ndarray, wrong: np.ndarray) -> str:
     return f"the value {array[place]} at {place}"
 
 
+def _in_range(name: str, value: Any, many: bool, low: float, high: float, wanted: str) -> None:
+    if not many:
+        shape(name, value, ())
+    array = _finite(name, value, f"a number, {wanted}")
+    if array is not None and np.any(wrong := (array < low) | (array > high)):
+        raise ValueError(f"{name} has {_offender(array, wrong)}; it must be {wanted}")
+
+
 def finite(name: str, value: Any) -> None:
     """Every entry of `value` is a finite number."""
-    _numbers(name, value)
+    _finite(name, value)
 
 
-def positive(name: str, value: Any) -> None:
-    """Every entry of `value` is above 0."""
-    array = _numbers(name, value)
-    if array is not None and np.any(array <= 0):
-        raise ValueError(f"{name} has {_offender(array, array <= 0)}; it must be above 0")
+def positive(name: str, value: Any, *, many: bool = False) -> None:
+    """`value` is a number above 0, or an array of such if there may be many."""
+    _in_range(name, value, many, SMALLEST, LARGEST, f"above 0, at least {SMALLEST:g}")
 
 
-def not_negative(name: str, value: Any) -> None:
-    """Every entry of `value` is 0 or more."""
-    array = _numbers(name, value)
-    if array is not None and np.any(array < 0):
-        raise ValueError(f"{name} has {_offender(array, array < 0)}; it must be 0 or more")
+def not_negative(name: str, value: Any, *, many: bool = False) -> None:
+    """`value` is a number of 0 or more, or an array of such if there may be many."""
+    _in_range(name, value, many, 0, LARGEST, "0 or more")
 
 
-def fraction(name: str, value: Any) -> None:
-    """Every entry of `value` is in [0, 1]."""
-    array = _numbers(name, value)
-    if array is not None and np.any(wrong := (array < 0) | (array > 1)):
-        raise ValueError(f"{name} has {_offender(array, wrong)}; it must be in [0, 1]")
+def fraction(name: str, value: Any, *, many: bool = False) -> None:
+    """`value` is a number in [0, 1], or an array of such if there may be many."""
+    _in_range(name, value, many, 0, 1, "in [0, 1]")
+
+
+def size(name: str, value: Any) -> tuple[int, ...]:
+    """The shape of `value`."""
+    try:
+        found = np.shape(value)
+    except Exception:
+        found = None
+    if not isinstance(found, tuple):  # a class has something else of this name
+        raise _other(name, value, NUMBERS)
+    return found
 
 
 def shape(name: str, value: Any, allowed: tuple[int | str, ...]) -> None:
     """`value` has the shape `allowed`, where a string stands for any size above 0."""
-    try:
-        actual = np.shape(value)
-    except ValueError:  # lists of different lengths
-        _numbers(name, value)
-        raise
+    actual = size(name, value)
     fits = len(actual) == len(allowed) and all(
-        size > 0 if isinstance(want, str) else size == want
-        for size, want in zip(actual, allowed, strict=True)
+        n > 0 if isinstance(want, str) else n == want
+        for n, want in zip(actual, allowed, strict=True)
     )
     if not fits:
         text = ", ".join(str(want) for want in allowed) + ("," if len(allowed) == 1 else "")
@@ -90,7 +134,15 @@ def shape(name: str, value: Any, allowed: tuple[int | str, ...]) -> None:
 def number(name: str, value: Any) -> None:
     """`value` is one finite number."""
     shape(name, value, ())
-    _numbers(name, value)
+    _finite(name, value)
+
+
+def constant(name: str, value: Any) -> float:
+    """`value`, a number above 0 that is known while a program is traced."""
+    positive(name, value)
+    if isinstance(value, jax.core.Tracer):
+        raise _other(name, value, "a number that is not traced")
+    return float(value)
 
 
 def vector(name: str, value: Any) -> None:
@@ -103,34 +155,54 @@ def direction(name: str, value: Any) -> None:
     """`value` is a finite 3-vector that is not zero."""
     vector(name, value)
     array = known(value)
-    if array is not None and not np.any(array != 0):
-        raise ValueError(f"{name} is {_short(value)}; it must not be the zero vector")
+    if array is not None and np.abs(array).max() < SMALLEST:
+        raise _other(name, value, "a vector that is not zero")
 
 
 def instance(name: str, value: Any, kind: type) -> None:
     """`value` is of a class."""
     if not isinstance(value, kind):
-        raise ValueError(f"{name} is {_short(value)}; it must be of class {kind.__name__}")
+        raise _other(name, value, f"of class {kind.__name__}")
 
 
 def several(name: str, value: Any, kind: type) -> tuple[Any, ...]:
     """`value` as a tuple, all of whose entries are of a class."""
     if not isinstance(value, list | tuple):
-        wanted = f"a tuple, whose entries are of class {kind.__name__}"
-        raise ValueError(f"{name} is {_short(value)}; it must be {wanted}")
+        raise _other(name, value, f"a tuple, whose entries are of class {kind.__name__}")
     for entry in value:
         instance(f"an entry of {name}", entry, kind)
     return tuple(value)
 
 
 def choice(name: str, value: Any, allowed: Sequence[Any]) -> None:
-    """`value` is one of `allowed`."""
-    if value not in allowed:
-        listed = ", ".join(repr(a) for a in allowed)
-        raise ValueError(f"{name} is {value!r}; it must be one of {listed}")
+    """`value` is one of `allowed`, and of the same class."""
+    if not any(isinstance(value, type(a)) and value == a for a in allowed):
+        raise _other(name, value, f"one of {listed(allowed)}")
 
 
-def whole(name: str, value: Any, *, least: int) -> None:
-    """`value` is an int of at least `least`."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}")
+def flag(name: str, value: Any) -> None:
+    """`value` is True or False."""
+    choice(name, value, (True, False))
+
+
+def whole(name: str, value: Any, *, least: int, most: int = 1_000_000) -> None:
+    """`value` is an int from `least` to `most`."""
+    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not integer or not least <= value <= most:
+        raise _other(name, value, f"a whole number of at least {least} and at most {most}")
+
+
+def path(name: str, value: Any) -> Path:
+    """`value` as a path."""
+    with suppress(TypeError):
+        found = Path(value)
+        if found.name and "\0" not in found.name:
+            return found
+    raise _other(name, value, "the path of a file")
+
+
+def text(name: str, value: Any) -> None:
+    """`value` is a name that fits into one line, and that leaves can go by."""
+    fits = isinstance(value, str) and 0 < len(value) <= 100 and value.isprintable()
+    if not fits or "." in value:
+        raise _other(name, value, "a printable text without '.', of at most 100 characters")

@@ -49,9 +49,9 @@ class Direct(Solver):
     keeps_forces: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check.whole("solver.newton_steps", self.newton_steps, least=1)
+        check.whole("solver.newton_steps", self.newton_steps, least=1, most=100)
         check.positive("solver.frame_inertia", self.frame_inertia)
-        check.whole("solver.substeps", self.substeps, least=1)
+        check.whole("solver.substeps", self.substeps, least=1, most=100_000)
 
     def solve(
         self, rod: Rod, state: State, positions: Array, orientations: Array, rest: Any, dt: float

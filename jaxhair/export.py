@@ -49,10 +49,11 @@ def save(
     Raises ValueError for another ending, kind or frame, and FileExistsError.
     """
     ending = check_ending(path)
+    check.instance("recording", recording, Recording)
     frames = len(recording.phases)
-    check.whole("frame", frame, least=-frames)
-    if frame >= frames:
-        raise ValueError(f"frame is {frame}; it must be below {frames}")
+    check.whole("frame", frame, least=-frames, most=frames - 1)
+    check.flag("overwrite", overwrite)
+    check.flag("progress", progress)
     if color_by is not None:
         check.choice("color_by", color_by, BONDS)
     counts = recording.scene.strands.counts
@@ -67,9 +68,10 @@ def save(
 
 def check_ending(path: str | os.PathLike[str]) -> str:
     """The path's ending, in lower case. Raises ValueError if no format goes by it."""
-    ending = Path(path).suffix.lower()
+    ending = check.path("output", path).suffix.lower()
     if ending not in ENDINGS:
-        raise ValueError(f"output is {str(path)!r}; its name must end in {', '.join(ENDINGS)}")
+        shown = check.short(Path(path).name)
+        raise ValueError(f"output is {shown}; its name must end in {', '.join(ENDINGS)}")
     return ending
 
 

@@ -35,9 +35,9 @@ class Fibre:
     peeling_rate: Any = 0.33
 
     def __post_init__(self) -> None:
-        check.fraction("fibre.stiffness", self.stiffness)
-        check.fraction("fibre.cuticle_share", self.cuticle_share)
-        check.not_negative("fibre.peeling_rate", self.peeling_rate)
+        check.fraction("fibre.stiffness", self.stiffness, many=True)
+        check.fraction("fibre.cuticle_share", self.cuticle_share, many=True)
+        check.not_negative("fibre.peeling_rate", self.peeling_rate, many=True)
 
 
 @pytree
@@ -72,11 +72,11 @@ class PhysicalFibre:
     def __post_init__(self) -> None:
         for name in ("young_modulus", "shear_modulus", "radius", "minor_radius", "density"):
             if name != "minor_radius" or self.minor_radius is not None:
-                check.positive(f"fibre.{name}", getattr(self, name))
-        check.fraction("fibre.cuticle_share", self.cuticle_share)
-        check.not_negative("fibre.peeling_rate", self.peeling_rate)
+                check.positive(f"fibre.{name}", getattr(self, name), many=True)
+        check.fraction("fibre.cuticle_share", self.cuticle_share, many=True)
+        check.not_negative("fibre.peeling_rate", self.peeling_rate, many=True)
         if self.damping_time is not None:
-            check.not_negative("fibre.damping_time", self.damping_time)
+            check.not_negative("fibre.damping_time", self.damping_time, many=True)
 
     @property
     def area(self) -> Any:

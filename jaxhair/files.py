@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxhair import check
 from jaxhair.arrays import contents, numbers, unzip, zip_arrays
 from jaxhair.output import new_file
 
@@ -87,7 +88,12 @@ class Curves:
         finite; and where a few strands are so much longer than the others that padding all to
         one length would need over a hundred times the memory.
         """
-        arrays = [numbers(f"strand {i}", s, "fiu") for i, s in enumerate(strands)]
+        try:
+            given = list(strands)
+        except Exception:  # whatever a foreign object raises
+            wanted = "it must be a list of arrays, one a strand"
+            raise ValueError(f"strands is {check.short(strands)}; {wanted}") from None
+        arrays = [numbers(f"strand {i}", s, "fiu") for i, s in enumerate(given)]
         for i, array in enumerate(arrays):
             if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
                 raise ValueError(
@@ -123,9 +129,10 @@ def read_curves(
     as uneven as `Curves.from_list` refuses. No more memory is taken than the file's size warrants.
     FileNotFoundError and other OSError where it cannot be opened.
     """
-    path = Path(path)
+    path = check.path("path", path)
     reader, _ = _format(path)
     _check_unit(unit, up)
+    check.flag("skip_short", skip_short)
     data = contents(path)
     try:
         points, counts = reader(data)
@@ -173,9 +180,10 @@ def write_curves(
     it exists or its folder does not. Raises ValueError where the ending is another, a coordinate
     is too large for float32, or a strand has more than 65,536 points and the file is a .hair.
     """
-    path = Path(path)
+    path = check.path("path", path)
     _, writer = _format(path)
     _check_unit(unit, up)
+    check.instance("curves", curves, Curves)
     with np.errstate(over="ignore"):  # reported below
         points = curves.points / unit
     if up == "y":
@@ -203,11 +211,11 @@ def _check_counts(counts: NDArray[Any], strands: int, *, least: int, most: int) 
 def _check_unit(unit: float, up: str) -> None:
     # the bounds catch mistakes, and keep a product of float32 and unit far from float64's limits
     if isinstance(unit, bool) or not isinstance(unit, int | float | np.integer | np.floating):
-        raise ValueError(f"unit is {unit!r}; it must be a number, the file's unit in metres")
+        wanted = "it must be a number, the file's unit in metres"
+        raise ValueError(f"unit is {check.short(unit)}; {wanted}")
     if not 1e-12 <= unit <= 1e12:
-        raise ValueError(f"unit is {unit!r}; it must be from 1e-12 to 1e12 metres")
-    if up not in ("y", "z"):
-        raise ValueError(f"up is {up!r}; it must be one of 'y', 'z'")
+        raise ValueError(f"unit is {check.short(unit)}; it must be from 1e-12 to 1e12 metres")
+    check.choice("up", up, ("y", "z"))
 
 
 def _padded(points: Points, counts: Counts) -> Points:
@@ -360,5 +368,6 @@ def _format(path: Path) -> tuple[Reader, Writer]:
     """Reader and writer of the format that the ending of `path` stands for."""
     ending = path.suffix.lower()
     if ending not in _FORMATS:
-        raise ValueError(f"{path} ends in {ending!r}; it must end in one of {', '.join(_FORMATS)}")
+        wanted = f"it must end in one of {', '.join(_FORMATS)}"
+        raise ValueError(f"{check.short(path.name)} ends in {check.short(ending)}; {wanted}")
     return _FORMATS[ending]

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxhair import check
@@ -94,8 +95,13 @@ class Wind(VelocityEffect):
         check.vector(f"{name}.blower", self.blower)
         check.vector(f"{name}.target", self.target)
         blower, target = check.known(self.blower), check.known(self.target)
-        if blower is not None and target is not None and not (blower != target).any():
-            raise ValueError(f"{name}.target is {self.target!r}; it must differ from the blower")
+        if (
+            blower is not None
+            and target is not None
+            and np.abs(blower - target).max() < check.SMALLEST
+        ):
+            given = check.short(self.target)
+            raise ValueError(f"{name}.target is {given}; it must differ from the blower")
         check.not_negative(f"{name}.strength", self.strength)
         check.positive(f"{name}.width", self.width)
 

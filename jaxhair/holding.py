@@ -23,7 +23,8 @@ class Hold(HoldingEffect):
         clamped: the end's edge keeps its direction too; otherwise it turns freely.
         velocity: [m/s], shape (3,); None stands still.
         angular_velocity: [rad/s], shape (3,), about a centre that moves along; None does not turn.
-        centre: of the turn at the start of the phase [m], shape (3,); the origin if None.
+        centre: of the turn at the start of the phase [m], shape (3,); the origin if None, which it
+            must be where nothing turns.
     """
 
     part: str = static(default="root")
@@ -34,10 +35,13 @@ class Hold(HoldingEffect):
 
     def __post_init__(self) -> None:
         check.choice("Hold.part", self.part, ("root", "tip"))
-        check.choice("Hold.clamped", self.clamped, (True, False))
+        check.flag("Hold.clamped", self.clamped)
         for name in ("velocity", "angular_velocity", "centre"):
             if getattr(self, name) is not None:
                 check.vector(f"Hold.{name}", getattr(self, name))
+        if self.centre is not None and self.angular_velocity is None:
+            wanted = "it must be None without angular_velocity, which turns about it"
+            raise ValueError(f"Hold.centre is {check.short(self.centre)}; {wanted}")
 
     def held_points(self, rod: Rod) -> Array:
         """True at the first or last point of each strand."""
@@ -92,12 +96,11 @@ class Wound(PoseEffect):
     climb: Any = 0.0
 
     def __post_init__(self) -> None:
-        check.number("Wound.diameter", self.diameter)
         check.positive("Wound.diameter", self.diameter)
         check.number("Wound.climb", self.climb)
         climb = check.known(self.climb)
-        if climb is not None and abs(climb).max() > jnp.pi / 2:
-            raise ValueError(f"Wound.climb is {self.climb!r}; it must be in [-pi/2, pi/2]")
+        if climb is not None and abs(climb) > jnp.pi / 2:
+            raise ValueError(f"Wound.climb is {float(climb)}; it must be in [-pi/2, pi/2]")
 
     def pose(self, rod: Rod, state: State) -> tuple[Array, Array]:
         """q_(i+1) = q_i r with the vector part l cos(a) / D (cos(a), 0, sin(a)) of r.

@@ -105,7 +105,6 @@ def movie(
     by waiting longer, so it can hold fewer frames.
     """
     suffix = check_suffix(path, ".gif", ".mp4")
-    check.shape("fps", fps, ())
     check.positive("fps", fps)
     if suffix == ".gif" and fps > 50:
         raise ValueError(f"fps is {fps!r}; it must be at most 50 for a .gif")
@@ -206,12 +205,12 @@ class _Scene:
         for side in size:
             check.whole("size", side, least=16)
         check.shape("color", color, (3,))
-        check.fraction("color", color)
+        check.fraction("color", color, many=True)
         if bonded is not None:
             bonded = np.asarray(bonded)
             given = bonded[0] if one else bonded
             check.shape("bonded", given, frames.shape[one:-1])
-            check.fraction("bonded", given)
+            check.fraction("bonded", given, many=True)
         self.count = len(frames)
         self.frames = frames
         self.bonded = bonded

@@ -6,6 +6,7 @@ from contextlib import suppress
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 T = TypeVar("T")
@@ -58,18 +59,21 @@ def _gather_numbers(cls: type) -> None:
     def post_init(self: Any) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not field.metadata.get("static") and _is_numbers(value):
-                with suppress(ValueError):  # lists of different lengths: left for the checks
-                    object.__setattr__(self, field.name, np.asarray(value, float))
+            if not field.metadata.get("static") and isinstance(value, list | tuple):
+                object.__setattr__(self, field.name, _gathered(value))
         if checks is not None:
             checks(self)
 
     cls.__post_init__ = post_init  # type: ignore[attr-defined]
 
 
-def _is_numbers(value: Any) -> bool:
-    return (
-        isinstance(value, list | tuple)
-        and len(value) > 0
-        and all(isinstance(x, int | float) or _is_numbers(x) for x in value)
-    )
+def _gathered(value: Any) -> Any:
+    try:
+        array = np.asarray(value)
+    except jax.errors.TracerArrayConversionError:
+        with suppress(Exception):
+            return jnp.asarray(value)
+        return value
+    except Exception:  # lists of different lengths, or of foreign objects: left for the checks
+        return value
+    return array.astype(float) if array.dtype.kind in "fiu" and array.size else value

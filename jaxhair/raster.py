@@ -33,8 +33,7 @@ class View:
 
     def __post_init__(self) -> None:
         for name in ("azimuth", "elevation"):
-            check.shape(f"view.{name}", getattr(self, name), ())
-            check.finite(f"view.{name}", getattr(self, name))
+            check.number(f"view.{name}", getattr(self, name))
         if abs(self.elevation) > math.pi / 2:
             raise ValueError(
                 f"view.elevation is {self.elevation!r}; it must be in [-pi/2, pi/2] (radians)"
@@ -42,7 +41,6 @@ class View:
         if self.target is not None:
             check.vector("view.target", self.target)
         if self.distance is not None:
-            check.shape("view.distance", self.distance, ())
             check.positive("view.distance", self.distance)
 
 

@@ -88,9 +88,8 @@ def simulate(
 
     Raises ValueError for fps that are not above 0, and NotFinite if values became NaN or infinite.
     """
-    check.number("fps", fps)
-    check.positive("fps", fps)
-    every = max(1, round(1 / (fps * scene.dt)))
+    check.instance("scene", scene, Scene)
+    every = max(1, round(1 / (check.constant("fps", fps) * scene.dt)))
     numbers = scene.as_arrays()
     times, names = _frame_times(scene, every)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scene)):

@@ -1,6 +1,6 @@
 """A scene: strands, their fibre and bonds, and the phases that they go through. Plain data."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,9 @@ from jaxhair.pytree import pytree, static
 from jaxhair.solvers import PositionBased, Solver
 from jaxhair.strands import Strands
 
+MOST_STEPS = 10**7
+"""Of a phase."""
+
 
 @pytree
 class Phase:
@@ -34,11 +37,9 @@ class Phase:
     effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name or "." in self.name:
-            raise ValueError(f"phase.name is {self.name!r}; it must be a text without '.'")
-        check.number(f"phase {self.name!r}.duration", self.duration)
-        check.positive(f"phase {self.name!r}.duration", self.duration)
-        object.__setattr__(self, "duration", float(self.duration))
+        check.text("phase.name", self.name)
+        duration = check.constant(f"phase {self.name!r}.duration", self.duration)
+        object.__setattr__(self, "duration", duration)
         effects = check.several(f"phase {self.name!r}.effects", self.effects, Effect)
         object.__setattr__(self, "effects", effects)
 
@@ -85,19 +86,22 @@ class Scene:
         damping = getattr(self.fibre, "damping_time", None)
         if not self.solver.compliant and damping is not None:
             raise ValueError(
-                f"fibre.damping_time is {damping!r}; with {type(self.solver).__name__}, which "
-                "does not compute it, it must be None"
+                f"fibre.damping_time is {check.short(damping)}; with "
+                f"{type(self.solver).__name__}, which does not compute it, it must be None"
             )
         if not isinstance(self.fibre, PhysicalFibre):
             check.instance("scene.fibre", self.fibre, Fibre)
         object.__setattr__(self, "phases", check.several("scene.phases", self.phases, Phase))
-        check.number("scene.dt", self.dt)
-        check.positive("scene.dt", self.dt)
-        object.__setattr__(self, "dt", float(self.dt))
+        object.__setattr__(self, "dt", check.constant("scene.dt", self.dt))
         names = [phase.name for phase in self.phases]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"scene.phases has {name!r} twice; names must differ")
+        for phase in self.phases:
+            if names.count(phase.name) > 1:
+                raise ValueError(f"scene.phases has {phase.name!r} twice; names must differ")
+            if (steps := phase.steps(self.dt)) > MOST_STEPS:
+                raise ValueError(
+                    f"phase {phase.name!r}.duration is {phase.duration:g} s, {steps:.3g} steps of "
+                    f"scene.dt, {self.dt:g} s; a phase must have at most {MOST_STEPS:.0e}"
+                )
         self._check_bonds()
         self._check_forces()
         self._check_rods()
@@ -110,7 +114,7 @@ class Scene:
                 allowed = (strands, 4) if len(np.shape(value)) == 2 else (strands, inner, 4)
                 check.shape(f"bonds.{name}", value, allowed)
         for name, value in vars(self.fibre).items():
-            if value is not None and np.shape(value) not in ((), (1,), (strands,)):
+            if value is not None and check.size(name, value) not in ((), (1,), (strands,)):
                 check.shape(f"fibre.{name}", value, (strands,))
 
     def _check_forces(self) -> None:
@@ -149,8 +153,7 @@ class Scene:
 
     def first(self, seconds: float) -> "Scene":
         """This scene up to a simulated time [s], above 0."""
-        check.number("seconds", seconds)
-        check.positive("seconds", seconds)
+        seconds = check.constant("seconds", seconds)
         kept: list[Phase] = []
         left = round(seconds / self.dt)
         if left == 0:
@@ -167,9 +170,9 @@ class Scene:
             if phase.name == name:
                 return phase
         if not self.phases:
-            raise ValueError(f"phase is {name!r}; the scene has no phases")
-        listed = ", ".join(repr(phase.name) for phase in self.phases)
-        raise ValueError(f"phase is {name!r}; it must be one of {listed}")
+            raise ValueError(f"phase is {check.short(name)}; the scene has no phases")
+        listed = check.listed(phase.name for phase in self.phases)
+        raise ValueError(f"phase is {check.short(name)}; it must be one of {listed}")
 
     def as_arrays(self) -> "Scene":
         """This scene with every number as an array of the scene's dtype."""
@@ -194,19 +197,25 @@ def named_leaves(scene: Scene) -> dict[str, Any]:
 
     An effect goes by its class; where a phase has several of one class, the second is "Hold2".
     """
+    check.instance("scene", scene, Scene)
     leaves, _ = jax.tree_util.tree_flatten_with_path(scene)
     return {_name(path, scene): leaf for path, leaf in leaves}
 
 
-def replace_leaves(scene: Scene, values: dict[str, Any]) -> Scene:
-    """The scene with some leaves, by name, replaced. Nothing is checked, so values may be traced.
+def replace_leaves(scene: Scene, values: Mapping[str, Any]) -> Scene:
+    """The scene with some leaves, by name, replaced. Their ranges are not checked.
 
-    Raises ValueError for a name that the scene does not have.
+    Raises ValueError for a name that the scene does not have, or a value of another shape.
     """
+    check.instance("values", values, Mapping)
     names = named_leaves(scene)
-    for name in values:
+    for name, value in values.items():
         if name not in names:
-            raise ValueError(f"leaf is {name!r}; it must be one of {', '.join(names)}")
+            raise ValueError(
+                f"leaf is {check.short(name)}; it must be one of {check.listed(names)}"
+            )
+        check.shape(name, value, np.shape(names[name]))
+        check.numbers(name, value)
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: values.get(_name(path, scene), leaf), scene
     )

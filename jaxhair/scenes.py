@@ -42,7 +42,7 @@ def bed_hair(
 
     Phases: "lie down" (1 s), "asleep" (1 s), "get up" (1 s), "morning" (2 s).
     """
-    _check_size(strands, length)
+    _check(strands, length, seed, contact=contact, dry=dry)
     rng = np.random.default_rng(seed)
     head, gap = 0.09, 0.02  # radius of the head, and space below the tips at the start [m]
     outward = _cap(strands, half_angle=0.6)
@@ -91,7 +91,7 @@ def blow_dry(
 
     Phases: "press" (1 s), "blow" (3 s), "lift" (1 s), "hang" (4 s).
     """
-    _check_size(strands, length)
+    _check(strands, length, seed, contact=contact)
     rng = np.random.default_rng(seed)
     rows = 4
     x = (np.arange(strands) + 0.5) / strands * 0.24 - 0.12
@@ -149,8 +149,7 @@ def perm(
     Phases with winding: "wind" (3 s), "reduce" and "neutralise" (0.1 s each), "released". Without:
     "released, wound", "released, set", "released".
     """
-    _check_size(strands, length)
-    check.number("rod_diameter", rod_diameter)
+    _check(strands, length, seed, contact=contact, winding=winding, treated=treated)
     check.positive("rod_diameter", rod_diameter)
     rng = np.random.default_rng(seed)
     y = (np.arange(strands) - (strands - 1) / 2) * 0.002
@@ -210,10 +209,12 @@ def by_name(name: str, **options: Any) -> Scene:
     return SCENES[name](**options)
 
 
-def _check_size(strands: int, length: float) -> None:
+def _check(strands: int, length: float, seed: int, **flags: bool) -> None:
     check.whole("strands", strands, least=1)
-    check.number("length", length)
     check.positive("length", length)
+    check.whole("seed", seed, least=0, most=2**63)
+    for name, value in flags.items():
+        check.flag(name, value)
 
 
 def _always(contact: bool) -> tuple[Effect, ...]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxhair import bonds as bond
-from jaxhair import rods
+from jaxhair import check, rods
 from jaxhair.effects import (
     BondEffect,
     Effect,
@@ -211,6 +211,7 @@ def run(scene: Scene) -> dict[str, State]:
     A pure function: `jax.jit`, `grad`, `jvp` and `vmap` work on it, in any leaf of the scene.
     Without an outer `jit`, phases with the same effects are compiled once.
     """
+    check.instance("scene", scene, Scene)
     scene = scene.as_arrays()
     state = start(scene)
     bare = replace(scene, phases=())

@@ -74,10 +74,10 @@ class _Sweeping(Solver):
     substeps: int = static(default=1)
 
     def __post_init__(self) -> None:
-        check.whole("solver.iterations", self.iterations, least=1)
+        check.whole("solver.iterations", self.iterations, least=1, most=100_000)
         check.choice("solver.sweep", self.sweep, SWEEPS)
         check.positive("solver.orientation_weight", self.orientation_weight)
-        check.whole("solver.substeps", self.substeps, least=1)
+        check.whole("solver.substeps", self.substeps, least=1, most=100_000)
 
     def _swept(self, *arguments: Any) -> tuple[Array, Array]:
         sweep = _red_black if self.sweep == "red-black" else _sequential

@@ -5,8 +5,10 @@ A user's arrays have the strands first: (strands, points, 3). Inside, a `State` 
 lanes of the processor's vector registers.
 """
 
+from contextlib import suppress
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -17,6 +19,12 @@ from jaxhair.pytree import pytree, static
 
 BONDS = ("hydrogen", "ionic", "disulfide", "peptide")
 """The kinds of side-chain bonds, in the order of every array that has an axis of bonds."""
+
+DTYPES = ("float32", "float64")
+"""In which a simulation computes."""
+
+MOST_POINTS = 10**8
+"""Of all strands that are made together: 2.4 GB."""
 
 
 def strands_last(x: Any) -> Array:
@@ -74,20 +82,21 @@ class Strands:
                 f"strands.positions has {points} point a strand; it must have 2 or more"
             )
         check.finite("strands.positions", self.positions)
-        dtype = jnp.asarray(self.positions).dtype
-        if not jnp.issubdtype(dtype, jnp.floating):
-            raise ValueError(f"strands.positions is of dtype {dtype}; it must be a floating one")
+        dtype = str(jnp.asarray(self.positions).dtype)
+        if dtype not in DTYPES:
+            wanted = f"it must be one of {check.listed(DTYPES)}"
+            raise ValueError(f"strands.positions is of dtype {dtype}; {wanted}")
         check.shape("strands.orientations", self.orientations, (strands, points - 1, 4))
         check.finite("strands.orientations", self.orientations)
-        rows = 1 if np.shape(self.lengths)[:1] == (1,) else strands
+        check.flag("strands.ragged", self.ragged)
+        rows = 1 if check.size("strands.lengths", self.lengths)[:1] == (1,) else strands
         check.shape("strands.lengths", self.lengths, (rows, points - 1))
         if self.ragged:
-            check.not_negative("strands.lengths", self.lengths)
+            check.not_negative("strands.lengths", self.lengths, many=True)
             self._check_missing_edges()
         else:
-            check.positive("strands.lengths", self.lengths)
-        if np.shape(self.natural_shape) != (strands, points - 2, 3):
-            check.shape("strands.natural_shape", self.natural_shape, (strands, points - 2, 3))
+            check.positive("strands.lengths", self.lengths, many=True)
+        check.shape("strands.natural_shape", self.natural_shape, (strands, points - 2, 3))
         check.finite("strands.natural_shape", self.natural_shape)
         self._check_norms()
 
@@ -156,17 +165,18 @@ class Strands:
         check.shape("points", points, ("strands", "points", 3))
         check.finite("points", points)
         positions = jnp.asarray(points)
-        if not jnp.issubdtype(positions.dtype, jnp.floating):
+        if str(positions.dtype) not in DTYPES:
             positions = positions.astype(jnp.zeros(()).dtype)
         strands, size, _ = positions.shape
         if size < 2:
             raise ValueError(f"points has {size} point a strand; it must have 2 or more")
         ragged = counts is not None
         if ragged:
-            n = np.asarray(counts)
-            check.shape("counts", n, (strands,))
+            check.shape("counts", counts, (strands,))
+            n = np.asarray(None if isinstance(counts, jax.core.Tracer) else counts)
             if n.dtype.kind not in "iu" or np.any((n < 2) | (n > size)):
-                raise ValueError(f"counts is {n!r}; each must be a whole number in [2, {size}]")
+                wanted = f"each must be a whole number in [2, {size}]"
+                raise ValueError(f"counts is {check.short(n)}; {wanted}")
             last = jnp.asarray(np.minimum(np.arange(size), n[:, None] - 1))
             positions = jnp.take_along_axis(positions, last[..., None], axis=1)
         x = strands_last(positions)
@@ -208,19 +218,22 @@ class Strands:
             dtype: float32 or float64; JAX's default if not given.
         """
         check.shape("roots", roots, ("strands", 3))
+        strands, _ = np.shape(roots)
         check.finite("roots", roots)
-        if np.shape(directions) != (3,):
-            check.shape("directions", directions, np.shape(roots))
+        if check.size("directions", directions) != (3,):
+            check.shape("directions", directions, (strands, 3))
         check.finite("directions", directions)
-        if np.any(np.all(np.asarray(directions) == 0, axis=-1)):
+        toward = check.known(directions)
+        if toward is not None and np.any(np.abs(toward).max(axis=-1) < check.SMALLEST):
             raise ValueError(f"directions has a zero vector; none of {np.shape(directions)} may be")
-        check.number("length", length)
         check.positive("length", length)
         check.whole("points", points, least=2)
-        dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+        if points * strands > MOST_POINTS:
+            wanted = f"all strands together must have at most {MOST_POINTS}"
+            raise ValueError(f"points is {points} for {strands} strands; {wanted}")
+        dtype = _floating(dtype)
         start = strands_last(jnp.asarray(roots, dtype))
-        toward = np.broadcast_to(np.asarray(directions, dtype), np.shape(roots))
-        t = quat.unit(strands_last(toward))
+        t = quat.unit(strands_last(jnp.broadcast_to(jnp.asarray(directions, dtype), (strands, 3))))
         along = jnp.linspace(0.0, length, points).astype(dtype)
         x = start[None] + along[:, None, None] * t[None]
         q = quat.between(_e3_like(t), t)
@@ -228,6 +241,16 @@ class Strands:
         lengths = jnp.full((1, points - 1), length / (points - 1), dtype)
         shape = jnp.zeros((t.shape[-1], points - 2, 3), dtype)
         return Strands(strands_first(x), strands_first(q), lengths, shape)
+
+
+def _floating(dtype: Any) -> Any:
+    """A dtype of `DTYPES`, by default JAX's."""
+    if dtype is None:
+        return jnp.zeros(()).dtype
+    with suppress(Exception):  # whatever NumPy raises where it is no dtype at all
+        if np.dtype(dtype).name in DTYPES:
+            return np.dtype(dtype)
+    raise ValueError(f"dtype is {check.short(dtype)}; it must be one of {check.listed(DTYPES)}")
 
 
 def _e3_like(t: Array) -> Array:
@@ -247,7 +270,7 @@ def _check_apart(lengths: Array, exists: Array | None) -> None:
     if known is None:
         return
     there = np.ones(known.shape, bool) if exists is None else np.asarray(exists)
-    if np.any(wrong := (known <= 0) & there):
+    if np.any(wrong := (known < check.SMALLEST) & there):
         edge, _, strand = (int(i) for i in np.argwhere(wrong)[0])
         raise ValueError(
             f"points {edge} and {edge + 1} of strand {strand} coincide; "

@@ -10,6 +10,7 @@ meanwhile, so that one time step for each stage gives the same result.
 from collections.abc import Sequence
 from typing import Any
 
+from jaxhair import check
 from jaxhair.bonds import Cut, Reform
 from jaxhair.effects import Effect
 from jaxhair.forces import Drag, Gravity
@@ -46,13 +47,17 @@ def wound_treatment(
         unload: the released hair first takes the shape free of stress, see `Unloaded`; otherwise
             it uncoils from the rod in the given time.
     """
+    check.text("name", name)
+    check.instance("cut", cut, Cut)
+    check.flag("unload", unload)
     rod = Wound(rod_diameter, climb)
+    free = check.several("free", free, Effect)
     kinds = [kind for kind in BONDS if getattr(cut, kind) is not None]
     return (
         Phase(f"{name}, wound", AT_ONCE, (rod, cut)),
         Phase(f"{name}, set", AT_ONCE, (rod, Reform(**dict.fromkeys(kinds, 1.0)))),
         *((Phase(f"{name}, unloaded", AT_ONCE, (Unloaded(),)),) if unload else ()),
-        Phase(name, seconds, tuple(free)),
+        Phase(name, seconds, free),
     )
 
 
@@ -97,10 +102,13 @@ def wash(
         seconds: that the hair hangs wet, and then dry. free: the effects then.
         unload: the wet hair first takes the shape free of stress, see `Unloaded`.
     """
+    check.text("name", name)
+    check.flag("unload", unload)
+    free = check.several("free", free, Effect)
     wet = Cut(hydrogen=0.0)
     return (
         *((Phase(f"{name}, unloaded", AT_ONCE, (Unloaded(), wet)),) if unload else ()),
         Phase(f"{name}, wet", seconds, (*free, wet)),
         Phase(f"{name}, dried", AT_ONCE, (*free, Reform(hydrogen=1.0))),
-        Phase(name, seconds, tuple(free)),
+        Phase(name, seconds, free),
     )

@@ -158,7 +158,7 @@ def test_strands_without_inner_points_can_be_coloured(tmp_path: Path) -> None:
         ("a.xyz", {}, ["a.xyz", *ENDINGS]),
         ("npz", {}, ["'", "npz"]),
         ("a.npz", {"color_by": "metal"}, ["color_by", "'metal'", "hydrogen"]),
-        ("a.npz", {"frame": 4}, ["frame", "4", "below 4"]),
+        ("a.npz", {"frame": 4}, ["frame", "4", "at most 3"]),
         ("a.hair", {"frame": -5}, ["frame", "-5", "-4"]),
         ("a.hair", {"frame": 0.5}, ["frame", "0.5", "whole"]),
         ("a.png", {"size": (3, 3)}, ["size", "3", "16"]),

@@ -1,6 +1,7 @@
 """Measured settings as a table in a .csv file, the cheapest of them, and what the table says."""
 
 import csv
+import io
 import json
 import math
 import os
@@ -12,6 +13,7 @@ from typing import Any
 from jaxhair import check
 from jaxhair.accuracy.grid import COUNTS, SOLVERS, WEIGHTS, Setting, expression
 from jaxhair.accuracy.measuring import Cost, Row
+from jaxhair.arrays import contents, reason
 from jaxhair.output import new_file
 from jaxhair.solvers import Solver
 
@@ -98,13 +100,12 @@ def cheapest(
 
     Raises ValueError where no setting reaches the error; it says what the best one is.
     """
-    check.number("error", error)
     check.positive("error", error)
     if points is not None:
         check.whole("points", points, least=2)
     if dtype is not None:
         check.choice("dtype", dtype, ("float32", "float64"))
-    check.choice("gradient", gradient, (True, False))
+    check.flag("gradient", gradient)
     rows = read(PACKAGED if table is None else table)
     fitting = [
         row
@@ -238,24 +239,23 @@ def read(path: str | os.PathLike[str]) -> list[Row]:
 
     Raises ValueError naming the file, and the line, where it is none; OSError.
     """
-    with open(path, encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
+    data = contents(check.path("table", path))
+    as_written = "as python -m jaxhair accuracy writes it"
+    try:
+        reader = csv.DictReader(io.StringIO(data.decode("utf-8"), newline=""), strict=True)
         missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(
-                f"{path} has no column {missing[0]!r}; it must be an accuracy.csv, as "
-                "python -m jaxhair accuracy writes it"
-            )
-        rows = []
-        for line in reader:
-            try:
-                rows.append(_row(line))
-            except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(
-                    f"{path}, line {reader.line_num}: {error}; it must be a row as "
-                    "python -m jaxhair accuracy writes it"
-                ) from error
-    return rows
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: {error}; it must be an accuracy.csv, {as_written}") from error
+    if missing:
+        raise ValueError(
+            f"{path} has no column {missing[0]!r}; it must be an accuracy.csv, {as_written}"
+        )
+    try:
+        return [_row(line) for line in reader]
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
+        raise ValueError(
+            f"{path}, line {reader.line_num}: {reason(error)}; it must be a row {as_written}"
+        ) from error
 
 
 def _row(cells: dict[str, str]) -> Row:
