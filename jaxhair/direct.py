@@ -60,7 +60,7 @@ class Direct(Solver):
         unit = Units.of(rod, dt)
         moving = state.positions + dt * state.velocities
         moving = jnp.where(rod.point_weights > 0, moving, positions)
-        q = _turned(rod, moving / unit.length, orientations)
+        q = _turned(rod, moving / unit.length, rod.lengths / unit.length, orientations)
         assert state.forces is not None
         n = state.forces / unit.force
         for _ in range(self.newton_steps):
@@ -172,7 +172,13 @@ def _moved(rod: Rod, n: Array) -> Array:
     return rod.point_weights * (padded(n, 0, 1) - padded(n, 1, 0))
 
 
-def _turned(rod: Rod, p: Array, q: Array) -> Array:
-    """Frames turned, without twist, to where their edges point; held ones stay."""
-    turn = quat.between(quat.tangent(q), quat.unit(p[1:] - p[:-1]))
+def _turned(rod: Rod, p: Array, length: Array, q: Array) -> Array:
+    """Frames turned, without twist, to where their edges point; held ones stay.
+
+    An edge shorter than half its rest length says less and less of its direction, and none of it
+    where its points coincide: what is missing to the half is taken from the frame's own axis.
+    """
+    edge, axis = p[1:] - p[:-1], quat.tangent(q)
+    missing = jnp.maximum(length / 2 - quat.safe_norm(edge), 0)
+    turn = quat.between(axis, quat.unit(edge + missing * axis))
     return jnp.where(rod.edge_weights > 0, quat.unit(quat.multiply(turn, q)), q)

@@ -69,7 +69,9 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
     weakest = jnp.min(spring, axis=1, keepdims=True)
     bent = jnp.where(weakest > 0, quat.dot(moment, moment) / jnp.where(weakest > 0, weakest, 1), 0)
     rounding = 32 * np.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)
-    cover = bent / 4 + quat.safe_norm(moment) * quat.safe_norm(r[:, 1:]) + rounding
+    # |m| |Omega|, rounded off at its tip: at rest m is rounding, and so would be its direction
+    across = quat.safe_norm(jnp.concatenate([moment * quat.safe_norm(r[:, 1:]), rounding], axis=1))
+    cover = bent / 4 + across
     return Joints(r, spring, moment, cover)
 
 
@@ -104,7 +106,7 @@ def joint_matrices(joints: Joints) -> tuple[Array, Array, Array]:
     With a = (r_w I + [Omega]x) / 2, Omega changes by a phi_2 - a' phi_1 to first order. To second
     order, with the mean s and the difference d of the rotations, the energy has the term
     -(r_w / 4) m . (s x d), which is taken as it is, and terms in |m| |Omega| |s|^2. Both are
-    bounded by X |s|^2 / 2 with the cover X = |m|^2 / (4 min 4 B / h) + |m| |Omega|. It also has
+    bounded by X |s|^2 / 2 with the cover X = |m|^2 / (4 min 4 B / h) + |m| |Omega|. It is at least
     what rounding may take from 4 B / h, so that a strand that nothing keeps from spinning about
     itself can be solved for.
     """

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,18 +13,26 @@ from jax import lax
 from jaxhair import quaternion as quat
 from jaxhair.bonds import Bonds, Cut, Reform
 from jaxhair.contact import HairContact
-from jaxhair.fibre import Fibre
+from jaxhair.direct import Direct
+from jaxhair.fibre import Fibre, PhysicalFibre
 from jaxhair.forces import Drag, DryingWind, Gravity
 from jaxhair.holding import Hold
 from jaxhair.obstacles import Cylinder, Sphere
 from jaxhair.scene import Phase, Scene, replace_leaves
 from jaxhair.simulate import prepare, run, start, step
-from jaxhair.solvers import PositionBased
+from jaxhair.solvers import Compliant, PositionBased
 from jaxhair.strands import State, Strands
 
 TOLERANCE = {"float64": 1e-11, "float32": 3e-5}  # positions [m], after 20 steps
 ROUNDING = {"float64": 1e-15, "float32": 3e-7}
 DTYPES = pytest.mark.parametrize("dtype", TOLERANCE)
+SOLVERS: dict[str, Any] = {
+    "paper": PositionBased(iterations=3),
+    "sequential": PositionBased(iterations=3, sweep="sequential"),
+    "compliant": Compliant(iterations=3),
+    "direct": Direct(),
+}
+EACH = pytest.mark.parametrize("solver", SOLVERS)
 STEPS, DT = 20, 1 / 360
 
 
@@ -56,7 +65,7 @@ def curly(strands: int, points: int, seed: int = 5) -> np.ndarray:
     return np.concatenate([roots, edges], 1).cumsum(1)
 
 
-def with_everything(strands: Strands) -> Scene:
+def with_everything(strands: Strands, solver: str = "paper") -> Scene:
     """A scene with every effect that has no direction of its own, and numbers of each strand."""
     rng = np.random.default_rng(1)
     count = strands.count
@@ -71,19 +80,23 @@ def with_everything(strands: Strands) -> Scene:
         Sphere((0.04, 0.0, -0.06), 0.02, 0.3, angular_velocity=(1.0, 4.0, 0.0)),
         Cylinder((0.05, 0.02, -0.04), (0.2, 1.0, 0.1), 0.02, 0.6, 0.1, velocity=(0.0, 0.1, 0.1)),
     )
+    fibre: Any = Fibre(rng.uniform(0.2, 0.6, count), peeling_rate=rng.uniform(1, 3, count))
+    if SOLVERS[solver].compliant:
+        young, rate = rng.uniform(2e9, 6e9, count), rng.uniform(1, 3, count)
+        fibre = PhysicalFibre(young, minor_radius=30e-6, peeling_rate=rate, damping_time=1e-3)
     return Scene(
         strands,
-        Fibre(rng.uniform(0.2, 0.6, count), peeling_rate=rng.uniform(1, 3, count)),
+        fibre,
         Bonds(rng.uniform(0.1, 1, (count, 4)), rng.uniform(0.3, 0.9, (count, 4))),
         (Phase("only", 1.0, effects),),
-        PositionBased(iterations=3),
+        SOLVERS[solver],
     )
 
 
 @cache
-def scene_of_3(dtype: str) -> Scene:
+def scene_of_3(dtype: str, solver: str = "paper") -> Scene:
     strands = from_points(jnp.asarray(curly(3, 6)))
-    return as_dtype(with_everything(strands), dtype)
+    return as_dtype(with_everything(strands, solver), dtype)
 
 
 def as_dtype(scene: Scene, dtype: str) -> Scene:
@@ -101,10 +114,11 @@ def per_strand(scene: Scene, change: object) -> Scene:
     def each(part: object, *names: str) -> object:
         return replace(part, **{name: change(getattr(part, name)) for name in names})  # type: ignore
 
+    own = [name for name, value in vars(scene.fibre).items() if np.ndim(value) == 1]
     return replace(
         scene,
         strands=each(scene.strands, "positions", "orientations", "lengths", "natural_shape"),
-        fibre=each(scene.fibre, "stiffness", "peeling_rate"),
+        fibre=each(scene.fibre, *own),
         bonds=each(scene.bonds, "influence", "fraction"),
     )
 
@@ -118,9 +132,11 @@ def assert_same(one: State, other: State, tolerance: float) -> None:
     np.testing.assert_allclose(np.abs(np.sum(a * b, 1)), 1, rtol=0, atol=tolerance)
 
 
-def test_the_scene_does_something() -> None:
+@EACH
+def test_the_scene_does_something(solver: str) -> None:
     """Its strands move, meet, bend, dry and touch: an invariance of nothing would be no test."""
-    scene, end = scene_of_3("float64"), final(scene_of_3("float64"))
+    scene = scene_of_3("float64", solver)
+    end = final(scene)
     begin = start(scene.as_arrays())
     assert np.abs(end.positions - begin.positions).max() > 5e-3
     assert np.abs(end.fractions - begin.fractions)[:, [0, 1, 2]].min() > 1e-3
@@ -130,10 +146,11 @@ def test_the_scene_does_something() -> None:
         assert np.abs(final(without).positions - end.positions).max() > 1e-5, name
 
 
+@EACH
 @DTYPES
-def test_rigid_motion(dtype: str) -> None:
+def test_rigid_motion(dtype: str, solver: str) -> None:
     """The scene turned and shifted ends turned and shifted."""
-    scene = scene_of_3("float64")
+    scene = scene_of_3("float64", solver)
     turn = np.array([0.5, -0.1, 0.7, 0.5])
     turn, shift = turn / np.linalg.norm(turn), np.array([0.2, -0.1, 0.3])
     w, x, y, z = turn
@@ -173,10 +190,11 @@ def test_rigid_motion(dtype: str) -> None:
     assert_same(end, other_end, TOLERANCE[dtype])
 
 
+@EACH
 @DTYPES
-def test_signs_of_frames(dtype: str) -> None:
+def test_signs_of_frames(dtype: str, solver: str) -> None:
     """q and -q are the same frame: not one bit may differ."""
-    scene = scene_of_3(dtype)
+    scene = scene_of_3(dtype, solver)
     q = scene.strands.orientations
     signs = np.random.default_rng(3).choice(np.asarray([-1, 1], dtype), (*q.shape[:2], 1))
     end, other = final(scene), final(changed(scene, orientations=signs * q))
@@ -185,28 +203,33 @@ def test_signs_of_frames(dtype: str) -> None:
     np.testing.assert_array_equal(np.abs(end.orientations), np.abs(other.orientations))
 
 
+@EACH
 @DTYPES
-def test_order_of_strands(dtype: str) -> None:
+def test_order_of_strands(dtype: str, solver: str) -> None:
     order = [2, 0, 1]
-    end = final(scene_of_3(dtype))
-    other = final(per_strand(scene_of_3(dtype), lambda x: x[order]))
+    end = final(scene_of_3(dtype, solver))
+    other = final(per_strand(scene_of_3(dtype, solver), lambda x: x[order]))
     assert_same(jax.tree.map(lambda x: x[..., order], end), other, TOLERANCE[dtype])
 
 
+@EACH
 @DTYPES
-def test_frames_stay_unit(dtype: str) -> None:
-    norm = np.linalg.norm(np.asarray(final(scene_of_3(dtype)).orientations, float), axis=1)
+def test_frames_stay_unit(dtype: str, solver: str) -> None:
+    norm = np.linalg.norm(np.asarray(final(scene_of_3(dtype, solver)).orientations, float), axis=1)
     np.testing.assert_allclose(norm, 1, rtol=0, atol=ROUNDING[dtype])
 
 
-def test_float32_is_close_to_float64() -> None:
-    assert_same(final(scene_of_3("float64")), final(scene_of_3("float32")), TOLERANCE["float32"])
-    assert final(scene_of_3("float32")).positions.dtype == "float32"
+@EACH
+def test_float32_is_close_to_float64(solver: str) -> None:
+    end = final(scene_of_3("float32", solver))
+    assert_same(final(scene_of_3("float64", solver)), end, TOLERANCE["float32"])
+    assert end.positions.dtype == "float32"
 
 
-def test_a_strand_far_away() -> None:
+@EACH
+def test_a_strand_far_away(solver: str) -> None:
     """A fourth strand, out of reach of all others, changes nothing of theirs."""
-    scene = scene_of_3("float64")
+    scene = scene_of_3("float64", solver)
     four = per_strand(scene, lambda x: np.concatenate([x, x[:1]]))
     positions = np.array(four.strands.positions)
     positions[3] += 5.0

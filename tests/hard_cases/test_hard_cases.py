@@ -1,0 +1,96 @@
+"""Every hard case, for every solver in both precisions: values over a second, and derivatives.
+
+One compiled program serves all cases of one kind, so tests of a solver and precision belong in one
+process: run with `--dist loadgroup`.
+"""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hard_cases import contact, forces, geometry, materials, running, table
+from hard_cases.catalogue import CASES, DTYPES, SOLVERS, Setting
+
+CENTRAL = {"direct": (1e-9, 1e-4)}  # step, and largest difference relative to its terms
+CENTRAL_ELSE = 1e-6, 1e-6
+MODES = {"float64": 1e-9, "float32": 1e-4}
+UNIT = 1e-5  # of quaternions
+RANGE = 1e-6  # of fractions
+SHAPE = 1 + 1e-4  # of remembered shapes' norms
+
+assert {contact, forces, geometry, materials}  # imported for the cases that they list
+
+
+def settings(solvers: tuple[str, ...]) -> list[object]:
+    """All cases for each solver and precision, each of these in a process."""
+    return [
+        pytest.param(
+            name,
+            Setting(solver, dtype),
+            id=f"{solver}-{dtype}-{name}",
+            marks=[pytest.mark.xdist_group(f"{solver}-{dtype}")],
+        )
+        for solver in solvers
+        for dtype in DTYPES
+        for name in CASES
+    ]
+
+
+_last_setting: list[Setting] = []
+
+
+@pytest.fixture(autouse=True)
+def _few_programs(request: pytest.FixtureRequest) -> None:
+    """Forgets compiled programs when their solver and precision are done with: a process may have
+    65,530 pieces of memory mapped, of which hundreds of programs would need more."""
+    setting = getattr(request.node, "callspec", None) and request.node.callspec.params["setting"]
+    if setting and _last_setting != [setting]:
+        jax.clear_caches()
+        _last_setting[:] = [setting]
+
+
+@pytest.mark.parametrize(("name", "setting"), settings(tuple(SOLVERS)))
+def test_values(name: str, setting: Setting) -> None:
+    """All finite, and within the case's bounds; quaternions unit at every step."""
+    case = CASES[name].within(setting)
+    start = case.start(setting)
+    end, most = running.run(start, case.steps)
+    for leaf in jax.tree.leaves(end):
+        assert np.all(np.isfinite(leaf))
+    assert most.quaternion <= UNIT
+    assert most.fraction <= RANGE
+    assert most.shape <= SHAPE
+    assert most.speed <= case.speed
+    assert running.stretch(start, end) <= case.stretch
+    if case.check is not None:
+        case.check(start, end)
+
+
+@pytest.mark.parametrize(("name", "setting"), settings(("paper", "compliant", "direct")))
+def test_derivatives(name: str, setting: Setting) -> None:
+    """Finite in every number of scene and state; both modes agree; so do central differences
+    where the case is smooth."""
+    case = CASES[name].within(setting)
+    at = running.arrays(case.start(setting))
+    along = running.direction(at, case.fixed)
+    _, forward = running.along(at, along, case.slopes)
+    gradient = running.gradient(at, case.slopes)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
+    reverse, terms = running.product(gradient, along)
+    assert abs(float(forward) - reverse) <= MODES[setting.dtype] * terms
+    if setting.dtype == "float64" and case.smooth is True:
+        h, tolerance = CENTRAL.get(setting.solver, CENTRAL_ELSE)
+        above, below = (
+            float(running.along(running.shifted(at, along, d), along, case.slopes)[0])
+            for d in (h, -h)
+        )
+        assert abs((above - below) / (2 * h) - float(forward)) <= tolerance * terms
+
+
+def test_the_table_is_current() -> None:
+    """`python -m hard_cases.table`, run in tests/, writes it."""
+    written = Path(table.__file__).with_name("README.md").read_text(encoding="utf-8")
+    assert written == table.text()
