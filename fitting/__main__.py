@@ -11,7 +11,7 @@ from fitting.measured import Measured, packaged, read
 from fitting.parameters import Constraint, Positive, Simplex
 from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
-from jaxhair import read_curves
+from jaxhair import check, read_curves
 from jaxhair.__main__ import UNITS, length
 
 FREE: dict[str, Constraint] = {"bonds.influence": Simplex(), "fibre.peeling_rate": Positive()}
@@ -95,6 +95,7 @@ def _state_and_path(text: str) -> tuple[str | None, str]:
 
 
 def _fit(options: argparse.Namespace) -> int:
+    check.instance("--output", options.output, str)  # argparse makes a list of "--"
     folder = Path(options.output)
     if not options.overwrite and (folder / "fit.json").exists():
         raise FileExistsError(

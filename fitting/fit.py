@@ -164,13 +164,17 @@ def fit(
     """
     check.choice("method", method, METHODS)
     check.whole("steps", steps, least=1)
-    check.positive("tolerance", tolerance)
-    check.positive("noise_mm", noise_mm)
+    tolerance = check.constant("tolerance", tolerance)
+    noise_mm = check.constant("noise_mm", noise_mm)
+    prior_width = check.constant("prior_width", prior_width)
+    learning_rate = check.constant("learning_rate", learning_rate)
+    check.instance("scene", scene, Scene)
+    check.instance("targets", targets, Mapping)
     if not targets:
         raise ValueError("targets is empty; it must name at least one phase")
-    for name in targets:
+    for name, target in targets.items():
         scene.phase(name)
-    check.positive("prior_width", prior_width)
+        check.instance(f"targets[{name!r}]", target, Target)
     problem = Problem(Parameters(scene, free), targets, noise_mm / prior_width)
     begin = time.perf_counter()
     if method == "levenberg-marquardt":

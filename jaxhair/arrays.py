@@ -42,6 +42,7 @@ def write_arrays(
     ValueError where the ending is not .npz, a name is not a string or an entry is of another type.
     """
     path = check.path("path", path)
+    check.flag("overwrite", overwrite)
     if path.suffix.lower() != ".npz":
         raise ValueError(f"{path} ends in {path.suffix!r}; arrays must go to a file ending in .npz")
     for name in arrays:

@@ -4,6 +4,7 @@ Values are looked at only where they are known: under a JAX transformation an ar
 but no value, and then only the shape is checked.
 """
 
+import os
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -187,16 +188,16 @@ def flag(name: str, value: Any) -> None:
 
 def whole(name: str, value: Any, *, least: int, most: int = 1_000_000) -> None:
     """`value` is an int from `least` to `most`."""
-    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    integer = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
     if not integer or not least <= value <= most:
         raise _other(name, value, f"a whole number of at least {least} and at most {most}")
 
 
 def path(name: str, value: Any) -> Path:
     """`value` as a path."""
-    with suppress(TypeError):
+    with suppress(TypeError, UnicodeEncodeError):
         found = Path(value)
-        if found.name and "\0" not in found.name:
+        if found.name and b"\0" not in os.fsencode(found):
             return found
     raise _other(name, value, "the path of a file")
 

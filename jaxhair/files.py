@@ -184,6 +184,7 @@ def write_curves(
     _, writer = _format(path)
     _check_unit(unit, up)
     check.instance("curves", curves, Curves)
+    check.flag("overwrite", overwrite)
     with np.errstate(over="ignore"):  # reported below
         points = curves.points / unit
     if up == "y":
@@ -210,7 +211,9 @@ def _check_counts(counts: NDArray[Any], strands: int, *, least: int, most: int) 
 
 def _check_unit(unit: float, up: str) -> None:
     # the bounds catch mistakes, and keep a product of float32 and unit far from float64's limits
-    if isinstance(unit, bool) or not isinstance(unit, int | float | np.integer | np.floating):
+    if isinstance(unit, bool | np.timedelta64) or not isinstance(
+        unit, int | float | np.integer | np.floating
+    ):
         wanted = "it must be a number, the file's unit in metres"
         raise ValueError(f"unit is {check.short(unit)}; {wanted}")
     if not 1e-12 <= unit <= 1e12:

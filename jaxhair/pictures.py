@@ -200,7 +200,10 @@ class _Scene:
         if frames.shape[2] < 2:
             raise ValueError(f"{name} has 1 point a strand; it must have 2 or more")
         check.whole("hairs_per_strand", hairs_per_strand, least=1)
-        check.whole("seed", seed, least=0)
+        check.whole("seed", seed, least=0, most=2**63)
+        check.flag("scale_bar", scale_bar)
+        if view is not None:
+            check.instance("view", view, View)
         check.shape("size", size, (2,))
         for side in size:
             check.whole("size", side, least=16)

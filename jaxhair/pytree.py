@@ -25,7 +25,7 @@ def pytree(cls: type[T]) -> type[T]:
     `__post_init__` make no sense. `jax.tree_util.register_dataclass` would run them; here the
     fields are set without calling the constructor, so only what a user builds is checked.
 
-    A list or tuple of numbers becomes an array, so that it is one leaf.
+    A list or tuple of numbers, or what else NumPy takes for one, becomes an array: one leaf.
     """
     _gather_numbers(cls)
     cls = dataclasses.dataclass(frozen=True)(cls)
@@ -59,7 +59,7 @@ def _gather_numbers(cls: type) -> None:
     def post_init(self: Any) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not field.metadata.get("static") and isinstance(value, list | tuple):
+            if not field.metadata.get("static") and not isinstance(value, _LEAVES):
                 object.__setattr__(self, field.name, _gathered(value))
         if checks is not None:
             checks(self)
@@ -67,7 +67,11 @@ def _gather_numbers(cls: type) -> None:
     cls.__post_init__ = post_init  # type: ignore[attr-defined]
 
 
+_LEAVES = jax.Array, np.ndarray, np.generic, int, float, complex, str, bytes
+
+
 def _gathered(value: Any) -> Any:
+    """`value` as an array if it is a list of numbers or of a foreign class of arrays."""
     try:
         array = np.asarray(value)
     except jax.errors.TracerArrayConversionError:

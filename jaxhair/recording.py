@@ -89,6 +89,7 @@ def simulate(
     Raises ValueError for fps that are not above 0, and NotFinite if values became NaN or infinite.
     """
     check.instance("scene", scene, Scene)
+    check.flag("progress", progress)
     every = max(1, round(1 / (check.constant("fps", fps) * scene.dt)))
     numbers = scene.as_arrays()
     times, names = _frame_times(scene, every)

@@ -166,13 +166,11 @@ class Scene:
 
     def phase(self, name: str) -> Phase:
         """The phase of a name. Raises ValueError if there is none."""
-        for phase in self.phases:
-            if phase.name == name:
-                return phase
-        if not self.phases:
+        names = [phase.name for phase in self.phases]
+        if not names:
             raise ValueError(f"phase is {check.short(name)}; the scene has no phases")
-        listed = check.listed(phase.name for phase in self.phases)
-        raise ValueError(f"phase is {check.short(name)}; it must be one of {listed}")
+        check.choice("phase", name, names)
+        return self.phases[names.index(name)]
 
     def as_arrays(self) -> "Scene":
         """This scene with every number as an array of the scene's dtype."""

@@ -552,7 +552,7 @@ def test_an_interrupted_movie_leaves_nothing(name, tmp_path):
     [
         ("a.avi", {}, "a.avi'; its name must end in .gif or .mp4"),
         ("a.gif", {"fps": 60}, "fps is 60; it must be at most 50"),
-        ("a.gif", {"fps": 0}, "fps has the value 0; it must be above 0"),
+        ("a.gif", {"fps": 0}, r"fps has the value 0\.0; it must be above 0"),
         ("a.mp4", {"size": (121, 100)}, r"size is \(121, 100\); both must be even"),
         ("a.gif", {"meshes": [[]]}, "meshes has 1 entries; it must have 2"),
         ("a.gif", {"bonded": np.zeros((1, 12, 9))}, r"bonded has shape .* \(2, 12, 9\)"),
