@@ -58,16 +58,19 @@ class Direct(Solver):
     ) -> tuple[Array, Array, Array]:
         """Positions, orientations and forces [N]; see `Solver.solve`."""
         unit = Units.of(rod, dt)
-        moving = state.positions + dt * state.velocities
-        moving = jnp.where(rod.point_weights > 0, moving, positions)
-        q = _turned(rod, moving / unit.length, rod.lengths / unit.length, orientations)
+        start = state.positions / unit.length
+        moving = jnp.where(
+            rod.point_weights > 0, dt * state.velocities, positions - state.positions
+        )
+        q = _turned(rod, start, moving / unit.length, rod.lengths / unit.length, orientations)
         assert state.forces is not None
         n = state.forces / unit.force
         for _ in range(self.newton_steps):
             known = Known(rod, rest, state.orientations, positions / unit.length, q, n)
             n, phi = newton_step(known, jnp.asarray(self.frame_inertia, q.dtype), dt)
-            q = quat.unit(quat.multiply(q, quat.from_rotation_vector(phi)))
-        return positions + unit.length * _moved(rod, n), q, n * unit.force
+            q = quat.unit(quat.multiply(q, _rotation(phi)))
+        p = positions / unit.length + _moved(rod, n)
+        return unit.length * _shortened(rod, unit, p, n), q, n * unit.force
 
 
 class Known(NamedTuple):
@@ -172,13 +175,47 @@ def _moved(rod: Rod, n: Array) -> Array:
     return rod.point_weights * (padded(n, 0, 1) - padded(n, 1, 0))
 
 
-def _turned(rod: Rod, p: Array, length: Array, q: Array) -> Array:
-    """Frames turned, without twist, to where their edges point; held ones stay.
+def _shortened(rod: Rod, unit: Units, p: Array, n: Array) -> Array:
+    """Points whose edges are at most a tenth longer than their forces make them.
 
+    A Newton step turns edges along tangents: one that turns far is too long behind it, and would
+    fly back faster than it came. Such edges are shortened along the strand, away from held points
+    or, in a free strand, without moving its centre of mass. In motion that a time step resolves
+    nothing is changed.
+    """
+    edge = p[1:] - p[:-1]
+    allowed = rod.lengths / unit.length * (1.1 + unit.compliance * quat.safe_norm(n))
+    excess = jnp.maximum(quat.safe_norm(edge) - allowed, 0) * quat.unit(edge)
+    pulled = padded(jnp.cumsum(excess, axis=0), 1, 0)
+    w = rod.point_weights
+    free = w > 0
+    mass = jnp.where(free, 1 / jnp.where(free, w, 1), 1e6)
+    if rod.ragged:
+        mass = jnp.where(rod.point_exists(), mass, 0)
+    mean = jnp.sum(mass * pulled, axis=0, keepdims=True) / jnp.sum(mass, axis=0, keepdims=True)
+    return p + jnp.where(free, mean - pulled, 0)
+
+
+def _rotation(phi: Array) -> Array:
+    """The rotation by atan |phi| about phi: where the tangent that a frame is turned along leads.
+
+    (1 + sqrt(1 + |phi|^2), phi), made unit; phi has shape (edges, 3, strands).
+    """
+    real = 1 + jnp.sqrt(1 + quat.dot(phi, phi))
+    return quat.unit(jnp.concatenate([real, phi], axis=1))
+
+
+def _turned(rod: Rod, p: Array, change: Array, length: Array, q: Array) -> Array:
+    """Frames turned, without twist, to where their edges point after a change of the points; held
+    ones stay.
+
+    Of the change what is across the edge counts: an edge that shrinks fast must not turn around.
     An edge shorter than half its rest length says less and less of its direction, and none of it
     where its points coincide: what is missing to the half is taken from the frame's own axis.
     """
-    edge, axis = p[1:] - p[:-1], quat.tangent(q)
+    axis = quat.tangent(q)
+    across = change[1:] - change[:-1]
+    edge = p[1:] - p[:-1] + across - quat.dot(across, axis) * axis
     missing = jnp.maximum(length / 2 - quat.safe_norm(edge), 0)
     turn = quat.between(axis, quat.unit(edge + missing * axis))
     return jnp.where(rod.edge_weights > 0, quat.unit(quat.multiply(turn, q)), q)
