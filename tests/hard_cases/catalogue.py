@@ -5,7 +5,7 @@ could break in it and what must hold. `README.md` beside this file is a table ma
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 import jaxhair as jh
 from jaxhair.simulate import start
 
+SWEEPING = ("paper", "sequential", "compliant")
 SOLVERS: dict[str, Any] = {
     "paper": jh.PositionBased(),
     "sequential": jh.PositionBased(sweep="sequential"),
@@ -80,6 +81,8 @@ class Case:
         fixed: leaves (ends of their names) that are not varied in derivatives, since they are at
             the end of their range.
         slopes: steps over which derivatives are taken.
+        modes: largest difference between forward and reverse mode in float32, relative to the
+            terms that are summed; 1e-5 of it in float64.
         except_for: what a solver does not keep, and why; the other bounds still hold.
         check: whatever else must hold of the last state.
     """
@@ -94,8 +97,16 @@ class Case:
     smooth: bool | str = True
     fixed: tuple[str, ...] = ()
     slopes: int = 8
+    modes: float = 1e-4
     except_for: dict[str, dict[str, Any]] = field(default_factory=dict)
     check: Callable[[Start, jh.State], None] | None = None
+
+    def __post_init__(self) -> None:
+        known = {"why", *(f.name for f in fields(self))} - {"build", "except_for"}
+        for solver, own in self.except_for.items():
+            assert solver in SOLVERS
+            assert own.keys() <= known
+            assert "why" in own, "no exception without a reason"
 
     @property
     def name(self) -> str:

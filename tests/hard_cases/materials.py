@@ -9,6 +9,7 @@ import jaxhair as jh
 from hard_cases.catalogue import (
     HANGING,
     SOLVERS,
+    SWEEPING,
     WET,
     Setting,
     Start,
@@ -26,7 +27,10 @@ KEPT = "a fraction at the end of its range is kept there: a kink"
 
 @hard(breaks="nothing resists bending or twisting", fixed=("stiffness",))
 def k_of_0(s: Setting) -> jh.Scene:
-    return s.scene(COIL, *HANGING, k=0.0, physical=jh.PhysicalFibre(1e-3, 1e-3))
+    soft = jh.PhysicalFibre(
+        cuticle_share=1.0, peeling_rate=1e4
+    )  # a modulus of 0 would not stretch back
+    return s.scene(COIL, *HANGING, k=0.0, physical=soft)
 
 
 @hard(
@@ -111,7 +115,7 @@ def frames_of_great_inertia(s: Setting) -> jh.Scene:
     breaks="frames that turn at a touch",
     except_for={
         solver: {"stretch": 40.0, "why": "frames that follow without resisting hold no length"}
-        for solver in ("paper", "sequential", "compliant")
+        for solver in SWEEPING
     },
 )
 def frames_of_little_inertia(s: Setting) -> jh.Scene:

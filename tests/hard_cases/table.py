@@ -41,6 +41,8 @@ def text() -> str:
 
 def _row(case: Case) -> str:
     notes = [case.holds] if case.holds else []
+    if case.end_speed < 1e3:
+        notes.append(f"at the end below {case.end_speed:g} m/s")
     if case.steps != 360:
         notes.append(f"{case.steps} steps")
     if case.smooth is not True:
