@@ -11,8 +11,8 @@ from fitting.measured import Measured, packaged, read
 from fitting.parameters import Constraint, Positive, Simplex
 from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
-from jaxhair import check, read_curves
-from jaxhair.__main__ import UNITS, length
+from jaxhair import read_curves
+from jaxhair.__main__ import UNITS, length, parsed
 
 FREE: dict[str, Constraint] = {"bonds.influence": Simplex(), "fibre.peeling_rate": Positive()}
 
@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the fit; returns 0, or 1 if it did not converge, or 2 after a mistake in the request."""
-    options = parser().parse_args(arguments)
+    options = parsed(parser(), arguments)
     try:
         return _fit(options)
     except (ValueError, OSError, ImportError) as error:
@@ -95,7 +95,6 @@ def _state_and_path(text: str) -> tuple[str | None, str]:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    check.instance("--output", options.output, str)  # argparse makes a list of "--"
     folder = Path(options.output)
     if not options.overwrite and (folder / "fit.json").exists():
         raise FileExistsError(

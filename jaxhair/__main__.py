@@ -86,9 +86,18 @@ def length(text: str) -> float:
         raise argparse.ArgumentTypeError(message) from None
 
 
+def parsed(top: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The options; a value of "--", of which argparse makes an empty list, is a mistake."""
+    options = top.parse_args(arguments)
+    for name, value in vars(options).items():
+        if value == []:
+            top.error(f"argument --{name.replace('_', '-')}: expected a value")
+    return options
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns 0, or 2 after a mistake in what was asked, or 1 if it failed."""
-    options = parser().parse_args(arguments)
+    options = parsed(parser(), arguments)
     try:
         return accuracy.run(options) if options.command == "accuracy" else _simulate(options)
     except (ValueError, OSError, ImportError, NotFinite) as error:

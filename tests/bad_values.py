@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, event, settings
 from hypothesis import strategies as st
 
 FULL = os.environ.get("HYPOTHESIS_PROFILE") == "full"
@@ -198,6 +198,7 @@ def bad(draw: st.DrawFn, valid: Any) -> Any:
 def check_refusal(error: Exception, names: Iterable[str]) -> None:
     """A message of one line, not long, that names one of some things."""
     message = str(error)
+    event("refused")
     if isinstance(error, OSError) and error.filename:  # the system's own message
         return
     assert "\n" not in message

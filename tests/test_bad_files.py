@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bad_values import check_refusal, examples
-from hypothesis import given
+from hypothesis import event, given
 from hypothesis import strategies as st
 
 import fitting
@@ -243,6 +243,7 @@ def test_bad_commands(
             return
         finally:
             assert files(tmp_path) == before
+        event("refused")
         assert code == 2
         lines = capsys.readouterr().err.splitlines()
         if not lines[0].startswith("usage:"):

@@ -278,7 +278,9 @@ def small(scene: jh.Scene) -> bool:
 def plausible(scene: jh.Scene) -> bool:
     """Its numbers are such as a world has, and its steps few."""
     sizes = [np.abs(np.asarray(x, float)) for x in jax.tree.leaves(scene)]
-    moderate = all(np.all((x == 0) | ((x > 1e-6) & (x < 1e6)) | (x > 1e8)) for x in sizes)
+    moderate = all(
+        np.all((x == 0) | ((x > 1e-6) & (x < 1e6)) | ((x > 1e8) & (x < 1e10))) for x in sizes
+    )
     return moderate and 1e-4 < scene.dt < 1 and scene.duration < 100 * scene.dt
 
 

@@ -54,7 +54,6 @@ def run(options: argparse.Namespace) -> int:
     from jaxhair.figures import optional
 
     check.whole("--strands", options.strands, least=1)
-    check.instance("--output", options.output, str)  # argparse makes a list of "--"
     plan = grid.plan(strands=options.strands, quick=options.quick)
     optional("matplotlib")
     folder = Path(options.output)
