@@ -43,6 +43,12 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--method", choices=METHODS, default=METHODS[0], help=f"({METHODS[0]})")
     top.add_argument("--steps", type=int, default=50, help="largest number of simulations (50)")
     top.add_argument("--overwrite", action="store_true", help="replace files in DIR")
+    top.add_argument(
+        "--checkpoint",
+        metavar="DIR",
+        help="keep the work in this folder meanwhile; the same command goes on from there if it "
+        "was interrupted",
+    )
     top.add_argument("--quiet", action="store_true", help="show no progress")
     return top
 
@@ -116,6 +122,7 @@ def _fit(options: argparse.Namespace) -> int:
         method=options.method,
         steps=options.steps,
         progress=None if options.quiet else progress,
+        checkpoint=options.checkpoint,
     )
     print(table(result))
     written = write(result, folder, overwrite=options.overwrite, target=measured.title)

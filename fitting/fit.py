@@ -1,5 +1,6 @@
 """Fitting the numbers of a scene to wanted shapes."""
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,11 +17,15 @@ from fitting.determined import Direction, undetermined
 from fitting.parameters import Constraint, Parameters
 from fitting.targets import Target
 from jaxhair import Scene, check, run
+from jaxhair.checkpoints import Checkpoints, named, unnamed
 from jaxhair.strands import strands_first, strands_last
 
 Progress = Callable[[int, float], None]
 
 METHODS = ("levenberg-marquardt", "adam", "l-bfgs")
+JOURNAL_SECONDS = 2.0
+"""Between two writes of an optimiser's state."""
+
 MM = 1e3
 """Millimetres in a metre: residuals are fitted in mm."""
 
@@ -73,6 +78,15 @@ class Problem:
         self.start = parameters.packed()
         self._evaluate = jax.jit(self._residuals_and_jacobian)
         self._last: tuple[bytes, Any] = (b"", None)
+        self._journal: Checkpoints | None = None
+        self._known: dict[bytes, Any] = {}
+
+    def keep_in(self, journal: Checkpoints) -> None:
+        """Keeps every evaluation, and takes those that were kept before instead of simulating."""
+        self._journal = journal
+        for part in journal.parts:
+            states = {name: part[f"state {name}"] for name in self.targets}
+            self._known[part["point"].tobytes()] = (part["residuals"], part["jacobian"], states)
 
     @property
     def size(self) -> int:
@@ -118,10 +132,16 @@ class Problem:
         """
         point = jnp.asarray(free, self.parameters.scene.dtype)
         key = np.asarray(point).tobytes()
+        if self._last[0] != key and key in self._known:
+            self._last = (key, self._known[key])
         if self._last[0] != key:
             residuals, jacobian, states = self._evaluate(point)
             arrays = (np.asarray(residuals, float), np.asarray(jacobian, float))
             self._last = (key, (*arrays, jax.tree.map(np.asarray, states)))
+            if self._journal is not None:
+                parts = {f"state {name}": x for name, x in self._last[1][2].items()}
+                parts |= {"point": np.asarray(point), "residuals": arrays[0]}
+                self._journal.add({**parts, "jacobian": arrays[1]})
         found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] = self._last[1]
         return found
 
@@ -138,6 +158,7 @@ def fit(
     noise_mm: float = 0.1,
     prior_width: float = 3.0,
     progress: Progress | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> Fit:
     """The numbers of a scene with which its hair takes the wanted shapes.
 
@@ -159,6 +180,8 @@ def fit(
             standard deviation of a Gaussian prior. It keeps what the data do not determine near
             the start, and hardly moves what they do: 3 is a factor of 20 in a positive number.
         progress: called with the number of simulations so far and the residual [mm].
+        checkpoint: a folder in which the work is kept as it goes on. The same fit goes on from
+            there, however it ended, to the same result bit for bit.
 
     Raises ValueError for an unknown phase, leaf or method.
     """
@@ -176,14 +199,6 @@ def fit(
         scene.phase(name)
         check.instance(f"targets[{name!r}]", target, Target)
     problem = Problem(Parameters(scene, free), targets, noise_mm / prior_width)
-    begin = time.perf_counter()
-    if method == "levenberg-marquardt":
-        best, taken, converged = _levenberg_marquardt(problem, steps, tolerance, progress)
-    else:
-        best, taken, converged = _gradient_descent(
-            problem, method, steps, tolerance, learning_rate, progress
-        )
-    seconds = time.perf_counter() - begin
     settings = {
         "method": method,
         "steps": steps,
@@ -192,7 +207,31 @@ def fit(
         "prior_width": prior_width,
         "free": {name: repr(constraint) for name, constraint in free.items()},
     }
+    journal = None
+    if checkpoint is not None:
+        journal = Checkpoints(checkpoint, _work(problem, settings, learning_rate))
+    begin = time.perf_counter()
+    if method == "levenberg-marquardt":
+        if journal is not None:
+            problem.keep_in(journal)
+        best, taken, converged = _levenberg_marquardt(problem, steps, tolerance, progress)
+    else:
+        best, taken, converged = _gradient_descent(
+            problem, method, steps, tolerance, learning_rate, progress, journal
+        )
+    seconds = time.perf_counter() - begin
     return _result(problem, best, taken, converged, seconds, noise_mm, settings)
+
+
+def _work(problem: Problem, settings: dict[str, Any], learning_rate: float) -> Any:
+    """All that a fit's result depends on."""
+    scene = problem.parameters.scene
+    wanted = {
+        name: target.points(problem.lengths, scene.strands.count)
+        for name, target in problem.targets.items()
+    }
+    kinds = {name: (type(t).__name__, t.align) for name, t in problem.targets.items()}
+    return {f"{settings} {kinds} {learning_rate}": (scene, wanted)}
 
 
 def _levenberg_marquardt(
@@ -238,8 +277,12 @@ def _gradient_descent(
     tolerance: float,
     learning_rate: float,
     progress: Progress | None,
+    journal: Checkpoints | None,
 ) -> tuple[np.ndarray, int, bool]:
-    """Adam or L-BFGS on the mean square, until it falls no more by the relative tolerance."""
+    """Adam or L-BFGS on the mean square, until it falls no more by the relative tolerance.
+
+    Of a journal's parts the last one counts: the optimiser as it was after a number of steps.
+    """
 
     def loss(free: Array) -> Array:
         return jnp.sum(problem.residuals(free)[0] ** 2) / problem.size
@@ -261,8 +304,14 @@ def _gradient_descent(
     free = problem.parameters.packed()
     memory = optimiser.init(free)
     best, least = free, [np.inf]  # lowest loss after each step; Adam's own goes up and down
+    if journal is not None and journal.parts:
+        newest = journal.parts[-1]
+        kept = unnamed("optimiser", newest, (free, memory, best))
+        free, memory, best = jax.tree.map(jnp.asarray, kept)
+        least = [float(x) for x in newest["least"]]
     patience = 25 if method == "adam" else 3
-    for step in range(1, steps + 1):
+    written = time.monotonic()
+    for step in range(len(least), steps + 1):
         new, memory, value = update(free, memory)
         loss_now = float(value)
         if progress is not None:
@@ -275,6 +324,10 @@ def _gradient_descent(
         if step > patience and least[-1] > (1 - tolerance) * least[-1 - patience]:
             return np.asarray(best), step, True
         free = new
+        if journal is not None and time.monotonic() - written > JOURNAL_SECONDS:
+            state = named("optimiser", (free, memory, best))
+            journal.add({**state, "least": np.array(least)}, alone=True)
+            written = time.monotonic()
     return np.asarray(best), steps, False
 
 

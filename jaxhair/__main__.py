@@ -58,6 +58,12 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--seed", type=int, default=0, help="of the roots' places (0)")
     run.add_argument("--color-by", choices=BONDS, help="show a bonded fraction, blue 0 to red 1")
     run.add_argument("--size", type=int, default=800, help="of pictures, pixels (800)")
+    run.add_argument(
+        "--checkpoint",
+        metavar="DIR",
+        help="keep frames in this folder meanwhile; the same command goes on from there if it was "
+        "interrupted",
+    )
     run.add_argument("--quiet", action="store_true", help="show no progress")
     accuracy.add_command(commands)
     return top
@@ -161,8 +167,18 @@ def _simulate(options: argparse.Namespace) -> int:
     check_ending(options.output)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
-    recording = simulate(_scene(options), fps=options.fps, progress=not options.quiet)
-    if not recording.complete:
+    failure: NotFinite | None = None
+    try:
+        recording = simulate(
+            _scene(options),
+            fps=options.fps,
+            progress=not options.quiet,
+            checkpoint=options.checkpoint,
+        )
+    except NotFinite as error:
+        failure, recording = error, error.recording
+        print(f"error: {error}", file=sys.stderr)
+    if not recording.complete and failure is None:
         print(f"interrupted: {len(recording.phases)} frames are kept", file=sys.stderr)
     save(
         options.output,
@@ -173,6 +189,8 @@ def _simulate(options: argparse.Namespace) -> int:
         size=(options.size, options.size),
     )
     print(f"{options.output}: {len(recording.phases)} frames, {recording.times[-1]:.2f} s")
+    if failure is not None:
+        return 1
     return 0 if recording.complete else 130
 
 

@@ -9,7 +9,7 @@ from jax import Array, lax
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import VelocityEffect
-from jaxhair.pytree import pytree
+from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.strands import State
 
@@ -21,16 +21,21 @@ class HairContact(VelocityEffect):
     Arguments:
         radius: r [m]; a simulated strand stands for a wisp, so this is the wisp's radius.
         strength: alpha, acceleration of two strands that coincide [m/s^2].
+        in_gradients: False takes the pushes as given where derivatives are taken. Collisions are
+            chaotic: through many of them a gradient says nothing of where a scene tends to, and
+            a biased one that is smooth does (`tests/benchmarks/horizon.py` measures both).
 
     All pairs are looked at: time grows with the square of the number of strands.
     """
 
     radius: Any = 1e-3
     strength: Any = 20.0
+    in_gradients: bool = static(default=True)
 
     def __post_init__(self) -> None:
         check.positive("HairContact.radius", self.radius)
         check.not_negative("HairContact.strength", self.strength)
+        check.flag("HairContact.in_gradients", self.in_gradients)
 
     def velocity_change(self, rod: Rod, state: State, dt: float) -> Array:
         """dv = sum_j alpha (2r - D) / (2r) n dt over the edges j nearer than 2r (Eq. 18).
@@ -52,7 +57,8 @@ class HairContact(VelocityEffect):
 
         body = jax.checkpoint(against_edge, prevent_cse=False)
         total, _ = lax.scan(body, jnp.zeros_like(x), (x[:-1], x[1:], exists))
-        return self.strength * dt * total
+        pushed = self.strength * dt * total
+        return pushed if self.in_gradients else lax.stop_gradient(pushed)
 
     def _push(self, p: Array, start: Array, end: Array) -> Array:
         """(2r - D) / (2r) n of points (points, 3, strands, 1) from edges (3, strands)."""

@@ -54,8 +54,16 @@ def _exists(path: Path) -> FileExistsError:
 
 def _rename_to_free_name(source: Path, path: Path) -> None:
     """Rename `source` to `path`, or raise FileExistsError where the name is taken."""
-    # os.link would do this in one step, but not every file system has links; creating the file
-    # exclusively takes the name on all of them.
+    # A link appears whole or not at all, and never in place of another file.
+    try:
+        os.link(source, path)
+        return
+    except FileExistsError:
+        raise _exists(path) from None
+    except OSError:  # not every file system has links
+        pass
+    # Creating the file exclusively takes the name on all of them; a process that is killed at
+    # this place leaves an empty file.
     try:
         path.open("xb").close()
     except FileExistsError:

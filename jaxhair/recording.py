@@ -1,5 +1,7 @@
 """Simulating a whole scene and recording frames of it."""
 
+import os
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -10,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxhair import check
+from jaxhair import check, diagnosis
+from jaxhair.checkpoints import Checkpoints, named, unnamed
 from jaxhair.pytree import pytree, static
 from jaxhair.scene import Phase, Scene
 from jaxhair.simulate import Setup, advance, prepare, start, step
@@ -72,6 +75,8 @@ def simulate(
     fps: float = 30.0,
     observe: Callable[[State], Any] = positions_and_fractions,
     progress: bool = False,
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_seconds: float = 10.0,
 ) -> Recording:
     """Simulates a scene and records frames.
 
@@ -82,25 +87,42 @@ def simulate(
         fps: frames a second of simulated time; at most one a step is taken.
         observe: what to keep of a state, a function from `State` to any pytree of arrays.
         progress: show a progress bar on stderr.
+        checkpoint: a folder in which frames are kept as the work goes on. The same call with the
+            same scene goes on from there, however the work ended, to the same frames bit for bit.
+        checkpoint_seconds: wall time between two writes to it [s].
 
     Ctrl-C ends the simulation and returns the frames so far, with `complete` False. Under a JAX
-    transformation all frames are computed in one traced program, and nothing is shown.
+    transformation all frames are computed in one traced program, and nothing is shown or kept.
 
-    Raises ValueError for fps that are not above 0, and NotFinite if values became NaN or infinite.
+    Raises ValueError for fps that are not above 0 and for a checkpoint of other work, and
+    NotFinite if values became NaN or infinite.
     """
     check.instance("scene", scene, Scene)
     check.flag("progress", progress)
+    check.number("checkpoint_seconds", checkpoint_seconds)
+    check.not_negative("checkpoint_seconds", checkpoint_seconds)
     every = max(1, round(1 / (check.constant("fps", fps) * scene.dt)))
     numbers = scene.as_arrays()
     times, names = _frame_times(scene, every)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scene)):
+        if checkpoint is not None:
+            raise ValueError(
+                f"checkpoint is {checkpoint!r}; under a JAX transformation it must be None"
+            )
         observed = _traced(numbers, observe, every)
         return Recording(scene, jnp.asarray(times, scene.dtype), observed, tuple(names))
-    frames, complete = _interruptible(numbers, observe, every, progress)
-    observed = jax.tree.map(lambda *x: np.stack(x), *frames)
+    saver = _Saver(checkpoint, float(checkpoint_seconds), numbers, observe, every)
+    frames, complete, failure = _interruptible(numbers, observe, every, progress, saver)
     n = len(frames)
-    recording = Recording(scene, np.asarray(times[:n]), observed, tuple(names[:n]), complete)
-    _check_finite(recording)
+    recording = Recording(
+        scene,
+        np.asarray(times[:n]),
+        jax.tree.map(lambda *x: np.stack(x), *frames),
+        tuple(names[:n]),
+        complete,
+    )
+    if failure is not None:
+        raise NotFinite(_message(n, times[n], names[n], failure), recording)
     return recording
 
 
@@ -160,28 +182,94 @@ def _frame(
     return state, observe(state)
 
 
+class _Saver:
+    """Keeps frames in a checkpoint's folder, and what was kept there before; or keeps nothing."""
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str] | None,
+        seconds: float,
+        scene: Scene,
+        observe: Callable[[State], Any],
+        every: int,
+    ) -> None:
+        self._seconds, self._last = seconds, time.monotonic()
+        self._folder: Checkpoints | None = None
+        self.frames: list[Any] = []
+        self.state: State = start(scene)
+        self._written = 0
+        if folder is None:
+            return
+        name = f"{getattr(observe, '__module__', '')}.{getattr(observe, '__qualname__', observe)}"
+        self._folder = Checkpoints(folder, {"scene": scene, name: every})
+        like = jax.eval_shape(observe, self.state)
+        for part in self._folder.parts:
+            stacked = unnamed("observed", part, like)
+            count = len(jax.tree.leaves(stacked)[0])
+            self.frames += [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(count)]
+            self.state = jax.tree.map(jnp.asarray, unnamed("state", part, self.state))
+        self._written = len(self.frames)
+
+    def keep(self, frames: list[Any], state: State, *, now: bool = False) -> None:
+        """Writes the frames that are not written yet, and the state after the last one, if it is
+        time for it."""
+        due = now or time.monotonic() - self._last >= self._seconds
+        if self._folder is None or not due or len(frames) == self._written:
+            return
+        stacked = jax.tree.map(lambda *x: np.stack(x), *frames[self._written :])
+        self._folder.add({**named("observed", stacked), **named("state", state)})
+        self._written, self._last = len(frames), time.monotonic()
+
+
+Failure = tuple[Scene, Phase, Setup, State, int, int]
+"""Arguments of `jaxhair.diagnosis.cause`."""
+
+
 def _interruptible(
-    scene: Scene, observe: Callable[[State], Any], every: int, progress: bool
-) -> tuple[list[Any], bool]:
-    """Frame by frame, with a progress bar, until the end or Ctrl-C."""
+    scene: Scene, observe: Callable[[State], Any], every: int, progress: bool, saver: _Saver
+) -> tuple[list[Any], bool, Failure | None]:
+    """Frame by frame, with a progress bar, until the end, Ctrl-C or a value that is not finite."""
     total = sum(phase.steps(scene.dt) for phase in scene.phases)
     bar = _bar(total, progress)
-    state, bare = start(scene), replace(scene, phases=())
-    frames = [jax.tree.map(np.asarray, observe(state))]
+    bare = replace(scene, phases=())
+    frames = saver.frames or [jax.tree.map(np.asarray, observe(saver.state))]
+    # how many frames, and the state after them, in one object: Ctrl-C may come at any statement
+    kept = (len(frames), saver.state)
+    number = 0
     try:
         for phase in scene.phases:
-            setup = _prepare(bare, phase.effects)
-            first = 0
+            setup, first = None, 0
             for steps in _frame_steps(phase, every, scene.dt):
-                state, observed = _frame(observe, setup, state, jnp.int32(first), jnp.int32(steps))
-                frames.append(jax.tree.map(np.asarray, observed))
+                number += 1
+                if number >= kept[0]:
+                    setup = setup or _prepare(bare, phase.effects)
+                    before = kept[1]
+                    state, observed = _frame(
+                        observe, setup, before, jnp.int32(first), jnp.int32(steps)
+                    )
+                    frame = jax.tree.map(np.asarray, observed)
+                    if not _finite(frame):
+                        return frames, False, (scene, phase, setup, before, first, steps)
+                    del frames[kept[0] :]
+                    frames.append(frame)
+                    kept = (len(frames), state)
+                    saver.keep(frames, state)
                 first += steps
                 bar.update(steps)
     except KeyboardInterrupt:
-        return frames, False
+        return frames[: kept[0]], False, None
     finally:
+        saver.keep(frames[: kept[0]], kept[1], now=True)
         bar.close()
-    return frames, True
+    return frames, True, None
+
+
+def _finite(frame: Any) -> bool:
+    return all(
+        bool(np.isfinite(leaf).all())
+        for leaf in jax.tree.leaves(frame)
+        if np.issubdtype(leaf.dtype, np.inexact)
+    )
 
 
 class _NoBar:
@@ -198,32 +286,14 @@ def _bar(total: int, progress: bool) -> Any:
     return tqdm(total=total, unit="step", desc="simulating")
 
 
-def _check_finite(recording: Recording) -> None:
-    """Raises NotFinite naming the first frame and strand with a NaN or an infinity."""
-    frames = len(recording.phases)
-    finite = np.ones(frames, bool)
-    for leaf in jax.tree.leaves(recording.observed):
-        if np.issubdtype(leaf.dtype, np.floating):
-            finite &= np.isfinite(leaf).reshape(frames, -1).all(axis=1)
-    if finite.all():
-        return
-    bad = int(np.argmin(finite))
-    where = ""
-    if isinstance(recording.observed, dict) and "positions" in recording.observed:
-        positions = np.asarray(recording.positions[bad])
-        strands = recording.scene.strands
-        if positions.shape == (strands.count, strands.points, 3):
-            wrong = ~np.isfinite(positions).all(axis=(1, 2))
-            where = f", strand {int(np.argmax(wrong))}" if wrong.any() else ""
-    kept = Recording(
-        recording.scene,
-        recording.times[:bad],
-        jax.tree.map(lambda x: x[:bad], recording.observed),
-        recording.phases[:bad],
-        complete=False,
-    )
-    raise NotFinite(
-        f"values are not finite from frame {bad} on (t = {recording.times[bad]:g} s, phase "
-        f"{recording.phases[bad]!r}{where}); the frames before are in this error's .recording",
-        kept,
+def _message(frame: int, seconds: float, phase: str, failure: Failure) -> str:
+    """What NotFinite says, in one line."""
+    try:
+        place, reason = diagnosis.cause(*failure)
+    except Exception as error:  # the failure itself must be heard of, whatever else fails
+        place, reason = "", f"its cause was not found ({type(error).__name__})"
+    where = f", {place}" if place else ""
+    return (
+        f"values are not finite from frame {frame} on (t = {seconds:g} s, phase {phase!r}{where}): "
+        f"{reason or 'its cause was not found'}; the frames before are in this error's .recording"
     )

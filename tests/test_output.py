@@ -119,9 +119,31 @@ def test_an_interrupted_rename_leaves_nothing(tmp_path, monkeypatch, error, over
         raise error
 
     monkeypatch.setattr(output.os, "replace", replace)
+    monkeypatch.setattr(output.os, "link", replace)
     with pytest.raises(type(error)):
         write(tmp_path / "a.txt", "new", overwrite=overwrite)
     assert names(tmp_path) == []
+
+
+def test_a_new_name_never_shows_an_empty_file(tmp_path, monkeypatch):
+    """The name appears with its content, in one step; without links it works in two."""
+    path, open_ = tmp_path / "a.txt", output.Path.open
+
+    def opened(self, *arguments):
+        assert self != path, "a process killed here would leave an empty file"
+        return open_(self, *arguments)
+
+    monkeypatch.setattr(output.Path, "open", opened)
+    with new_file(path) as temporary, open(temporary, "w") as file:
+        file.write("new")
+    monkeypatch.undo()
+
+    def no_links(*_):
+        raise OSError("not here")
+
+    monkeypatch.setattr(output.os, "link", no_links)
+    write(tmp_path / "b.txt", "new", overwrite=False)
+    assert path.read_text() == (tmp_path / "b.txt").read_text() == "new"
 
 
 def test_two_writers_have_their_own_temporary_files(tmp_path):

@@ -155,8 +155,8 @@ def test_ctrl_c_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
     ("steps", "frame", "words"),
     [
         # After n steps the speed is n g dt; NaN comes in the first step that starts above.
-        (4.5, 2, "from frame 2 on (t = 0.06 s, phase 'a', strand 1)"),
-        (6.5, 4, "from frame 4 on (t = 0.1 s, phase 'b', strand 1)"),
+        (4.5, 2, "from frame 2 on (t = 0.06 s, phase 'a', strand 1, point 0): Fails"),
+        (6.5, 4, "from frame 4 on (t = 0.1 s, phase 'b', strand 1, point 0): Fails"),
     ],
 )
 def test_values_that_are_not_finite(steps: float, frame: int, words: str) -> None:
@@ -173,9 +173,9 @@ def test_values_that_are_not_finite(steps: float, frame: int, words: str) -> Non
 
 
 def test_not_finite_without_positions() -> None:
-    """What is observed may be anything; then no strand is named."""
+    """What is observed may be anything."""
     bad = Fails(4.5 * 9.8 * DT)
-    with pytest.raises(jh.NotFinite, match=r"frame 2 on \(t = 0.06 s, phase 'a'\);"):
+    with pytest.raises(jh.NotFinite, match=r"frame 2 on \(t = 0.06 s, phase 'a', strand 1"):
         jh.simulate(scene_of((bad,), (bad,)), fps=FPS, observe=tip_and_speed)
 
 

@@ -1,0 +1,87 @@
+"""Long work in whole parts, so that it can be killed at any moment and go on from the last part."""
+
+import hashlib
+import os
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxhair.arrays import read_arrays, write_arrays
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class Checkpoints:
+    """A folder of numbered parts, part-000000.npz and so on, of one piece of work.
+
+    Each part appears when it is complete. What a killed process left half written, under a
+    temporary name, is removed when the folder is opened.
+
+    Arguments:
+        folder: made if it is not there; for this work alone.
+        work: everything that the result depends on, as a pytree of arrays, texts and numbers. With
+            the versions of jaxhair and jax it makes the fingerprint that each part carries.
+
+    Raises ValueError where the folder holds parts of other work, or a part that is damaged.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], work: Any) -> None:
+        self.folder = Path(folder)
+        self._fingerprint = fingerprint(work)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for left in self.folder.glob(".new-*"):
+            left.unlink(missing_ok=True)
+        self.parts: list[Arrays] = []
+        """Those that were there when the folder was opened, in order."""
+        self._paths = sorted(self.folder.glob("part-*.npz"))
+        for path in self._paths:
+            try:
+                part = read_arrays(path)
+            except ValueError as error:
+                raise ValueError(f"{error}; delete the folder to start anew") from error
+            if str(part.pop("fingerprint", "")) != self._fingerprint:
+                raise ValueError(
+                    f"checkpoint {self.folder} is of other work (another scene, other options or "
+                    "another version); it must be another folder, or be deleted"
+                )
+            self.parts.append(part)
+
+    def add(self, arrays: Mapping[str, Any], *, alone: bool = False) -> None:
+        """Writes the next part. `alone`: it is all that is needed, and the others are deleted."""
+        number = int(self._paths[-1].stem.removeprefix("part-")) + 1 if self._paths else 0
+        path = self.folder / f"part-{number:06d}.npz"
+        write_arrays(path, {**arrays, "fingerprint": np.array(self._fingerprint)})
+        if alone:
+            for old in self._paths:
+                old.unlink()
+            self._paths = []
+        self._paths.append(path)
+
+
+def fingerprint(work: Any) -> str:
+    """A text of 64 characters that differs where work differs in structure, type or any bit."""
+    leaves, structure = jax.tree.flatten(work)
+    digest = hashlib.sha256()
+    for text in (version("jaxhair"), jax.__version__, str(structure)):
+        digest.update(text.encode() + b"\0")
+    for leaf in leaves:
+        array = np.asarray(leaf)
+        digest.update(f"{array.dtype} {array.shape}\0".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def named(prefix: str, tree: Any) -> Arrays:
+    """The leaves of a pytree as arrays named "prefix 0", "prefix 1" and so on."""
+    return {f"{prefix} {i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+
+
+def unnamed(prefix: str, arrays: Arrays, like: Any) -> Any:
+    """The pytree of the structure of `like` whose leaves `named` named."""
+    leaves, structure = jax.tree.flatten(like)
+    return jax.tree.unflatten(structure, [arrays[f"{prefix} {i}"] for i in range(len(leaves))])
