@@ -112,3 +112,23 @@ def test_simulated_winding_has_finite_gradients() -> None:
     start = {"bonds.influence": jnp.asarray([0.33, 0.3, 0.2, 0.17]), "fibre.stiffness": 0.05}
     slopes = jax.jit(jax.jacfwd(loss))(start)
     assert all(np.all(np.isfinite(g)) and np.any(g != 0) for g in slopes.values())
+
+
+def test_contact_may_be_left_out_of_gradients() -> None:
+    """Values stay bit for bit; the gradient is that of a run with the pushes given."""
+    hair = jh.Strands.straight(
+        [[0.0, 0, 0], [0.0, 1e-3, 0]], (0.0, 0, -1.0), length=0.2, points=5, dtype="float64"
+    )
+
+    def end(strength: Any, in_gradients: bool) -> jax.Array:
+        contact = jh.HairContact(2e-3, strength, in_gradients)
+        phase = jh.Phase("only", 10 * STEPS, (jh.Hold(), contact))
+        return jh.run(jh.Scene(hair, phases=(phase,)))["only"].points[1, -1, 1]
+
+    values, slopes = zip(
+        *(jax.value_and_grad(partial(end, in_gradients=b))(20.0) for b in (True, False)),
+        strict=True,
+    )
+    assert values[0] == values[1] > 1e-3
+    assert slopes[0] > 1e-9
+    assert slopes[1] == 0
