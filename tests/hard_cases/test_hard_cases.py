@@ -23,14 +23,18 @@ SHAPE = 1 + 1e-4  # of remembered shapes' norms
 assert {contact, forces, geometry, materials}  # imported for the cases that they list
 
 
-def settings(solvers: tuple[str, ...]) -> list[object]:
-    """All cases for each solver and precision, each of these in a process."""
+def settings(solvers: tuple[str, ...], *, later: str = "") -> list[object]:
+    """All cases for each solver and precision, each of these in a process; one precision may be
+    left to the slow run."""
     return [
         pytest.param(
             name,
             Setting(solver, dtype),
             id=f"{solver}-{dtype}-{name}",
-            marks=[pytest.mark.xdist_group(f"{solver}-{dtype}")],
+            marks=[
+                pytest.mark.xdist_group(f"{solver}-{dtype}"),
+                *([pytest.mark.slow] if dtype == later else []),
+            ],
         )
         for solver in solvers
         for dtype in DTYPES
@@ -69,7 +73,9 @@ def test_values(name: str, setting: Setting) -> None:
         case.check(start, end)
 
 
-@pytest.mark.parametrize(("name", "setting"), settings(("paper", "compliant", "direct")))
+@pytest.mark.parametrize(
+    ("name", "setting"), settings(("paper", "compliant", "direct"), later="float32")
+)
 def test_derivatives(name: str, setting: Setting) -> None:
     """Finite in every number of scene and state; both modes agree; so do central differences
     where the case is smooth."""
