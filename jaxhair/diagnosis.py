@@ -1,120 +1,252 @@
 """What made a simulation's values infinite or NaN: found by repeating the last steps one by one."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from jaxhair.bonds import changes
-from jaxhair.effects import BondEffect, HoldingEffect, PositionEffect, VelocityEffect, of_kind
+from jaxhair.bonds import rest_shape
+from jaxhair.effects import (
+    BondEffect,
+    HoldingEffect,
+    PoseEffect,
+    PositionEffect,
+    StiffnessEffect,
+    VelocityEffect,
+    of_kind,
+)
+from jaxhair.quaternion import relative
 from jaxhair.scene import Phase, Scene, named_leaves
-from jaxhair.simulate import Setup, step
-from jaxhair.strands import State
+from jaxhair.simulate import Setup
+from jaxhair.strands import BONDS, State
 
 ADVICE = {
     "Gravity": "take a smaller acceleration or a smaller dt",
-    "TipForce": "take a smaller force or, with Direct, newton_steps=2",
+    "TipForce": "take a smaller force, a smaller dt or, with Direct, newton_steps=2",
+    "Drag": "take a longer time",
     "Wind": "take a smaller strength or a smaller dt",
-    "DryingWind": "take a smaller strength or a smaller dt",
     "HairContact": "take a smaller strength, a larger radius or a smaller dt",
     "Hold": "let it move slower, or take a smaller dt",
-    "Floor": "let it move slower, or take a smaller dt",
-    "Sphere": "let it move slower, or take a smaller dt",
-    "Cylinder": "let it move slower, or take a smaller dt",
-    "PositionBased": "take more iterations or substeps, or a smaller dt",
-    "Compliant": "take more iterations or substeps, or a smaller dt",
+    "Obstacle": "let it move slower, or take a smaller dt",
+    "Cut": "take fractions in [0, 1] and a smaller rate",
+    "Reform": "take fractions in [0, 1] and a smaller rate",
+    "Soften": "take a factor in [0, 1]",
+    "Wound": "take a diameter well above the longest edge",
+    "Unloaded": "take influences and fractions whose products do not sum to 0",
+    "Bonds": "take influences of 0 or more whose sum is above 0",
+    "PositionBased": "take more iterations or substeps, another orientation_weight or a smaller dt",
+    "Compliant": "take more iterations or substeps, a larger orientation_weight or a smaller dt",
     "Direct": "take newton_steps=2, more substeps or a smaller dt",
 }
-OTHERWISE = "look at what it returns there"
+"""What to change, by class; a class without advice has that of the class it derives from."""
 
 
 class Cause(NamedTuple):
-    """Where and why: texts, "" where it is not known."""
+    """Where and why, as texts; the place is "" where it is not known."""
 
     place: str
     reason: str
 
 
-_step = jax.jit(step)
+class Part(NamedTuple):
+    """What a part of a step gives.
+
+    who: an effect, the scene's bonds, or None for what all velocities lead to.
+    value: array of any type, rows of points, edges or inner points first and strands last.
+    shift: by how much it moves a point more [m], shape (points, strands); None if not at all.
+    """
+
+    who: Any
+    value: Array
+    shift: Array | None = None
 
 
-def cause(scene: Scene, phase: Phase, setup: Setup, state: State, first: int, steps: int) -> Cause:
+def cause(
+    scene: Scene,
+    phase: Phase | None,
+    setup: Setup | None,
+    state: State,
+    one: Callable[[State, int], State],
+    first: int,
+    steps: int,
+) -> Cause:
     """The cause of values that are not finite after some steps.
 
     Arguments:
-        scene, phase: what was simulated. setup: of the phase.
-        state: the last good one. first: number of the step after it. steps: to repeat at most.
+        scene: as the user made it. phase, setup: of these steps; None where none was done.
+        state: the last good one. one: does a step, given the state and the step's number.
+        first: number of the step after the state. steps: to repeat at most.
     """
+    wrong, before, number = _wrong(state), state, first
+    while setup is not None and not wrong.any() and number < first + steps:
+        before, state = state, one(state, number)
+        wrong = _wrong(state) | _runs_away(setup, before, state)
+        number += 1
+    place = _place(wrong) if wrong.any() else ""
+    if leaf := _leaf_not_finite(scene, phase):
+        return Cause(place, leaf)
+    if not place:
+        return Cause("", "what `observe` returns is not finite, though all of the state is")
+    if setup is None or phase is None:
+        return Cause(place, "it is so from the start; look at the strands")
+    time = jnp.asarray((number - 1) * setup.dt, state.positions.dtype)
+    # with the numbers as the user gave them
+    phase = scene.phase(phase.name)
+    runs_away = not _wrong(state).any()
+    return _blame(scene, phase, setup, before, time, wrong, runs_away=runs_away)
+
+
+def _leaf_not_finite(scene: Scene, phase: Phase | None) -> str:
+    """The first number of the scene, as far as it matters in a phase, that is not finite."""
     for name, value in named_leaves(scene).items():
-        elsewhere = name.startswith("phases.") and not name.startswith(f"phases.{phase.name}.")
-        numbers = np.ravel(np.asarray(value, float))
-        wrong = numbers[~np.isfinite(numbers)]
-        if wrong.size and not elsewhere:
-            return Cause("", f"{name} has the value {wrong[0]}")
-    length = jnp.sum(setup.rod.lengths, axis=0, keepdims=True)
-    for number in range(first, first + steps):
-        time = jnp.asarray(number * setup.dt, state.positions.dtype)
-        after = _step(setup, state, time)
-        moved = jnp.abs(after.positions - state.positions)
-        far = (moved > length) & (setup.rod.point_weights > 0)
-        wrong = ~jnp.isfinite(after.positions) | far
-        if wrong.any():
-            return _blame(setup, state, time, np.asarray(wrong))
-        state = after
-    return Cause("", "")
-
-
-def _blame(setup: Setup, state: State, time: Any, wrong: np.ndarray) -> Cause:
-    """Who made a step go wrong: the first that gives what is not finite, else the strongest."""
-    strongest = ("", 0.0)
-    for name, value in _parts(setup, state, time):
-        x = np.asarray(value, float)
-        if not np.isfinite(x).all():
-            point, strand = _first(~np.isfinite(x))
-            points = len(state.positions) - len(x)  # inner points start at 1
-            return Cause(
-                f"strand {strand}, point {point + (points + 1) // 2}",
-                f"{name} gives values that are not finite there; {ADVICE.get(name, OTHERWISE)}",
+        if name.startswith("phases.") and (phase is None or name.split(".")[1] != phase.name):
+            continue
+        given = np.asarray(value)
+        with np.errstate(over="ignore"):
+            wrong = np.argwhere(~np.isfinite(given.astype(scene.dtype)))
+        if len(wrong):
+            place = tuple(int(i) for i in wrong[0])
+            where = f" at {place}" if place else ""
+            return (
+                f"{name} has the value {given[place]:g}{where}; it must be finite in {scene.dtype}"
             )
-        if x.shape == state.positions.shape and (size := float(np.abs(x).max())) > strongest[1]:
-            strongest = (name, size)
-    point, strand = _first(wrong)
-    place = f"strand {strand}, point {point}"
-    length = float(np.asarray(setup.rod.lengths).sum(axis=0).max())
-    name, size = strongest
-    if size * setup.dt > length:
-        text = f"{name} changes the velocity by {size:.2g} m/s in one step"
-        return Cause(place, f"{text}; {ADVICE.get(name, OTHERWISE)}")
-    solver = type(setup.solver).__name__
-    fault = "moves a point by more than its strand's length in one step"
-    return Cause(place, f"the solver, {solver}, {fault}; {ADVICE.get(solver, OTHERWISE)}")
+    return ""
 
 
-def _first(wrong: np.ndarray) -> tuple[int, int]:
-    """The strand, and its first point, with an entry of True: of (points, 3, strands) or
-    (points, strands)."""
-    at: np.ndarray = np.any(wrong, axis=1) if wrong.ndim == 3 else wrong
-    strand = int(np.argmax(at.any(axis=0)))
-    return int(np.argmax(at[:, strand])), strand
+def _blame(
+    scene: Scene,
+    phase: Phase,
+    setup: Setup,
+    state: State,
+    time: Any,
+    wrong: np.ndarray,
+    *,
+    runs_away: bool,
+) -> Cause:
+    """Who made a step go wrong: the first that gives what is not finite, else the strongest."""
+    who: list[Any] = []
+
+    def arrays(setup: Setup, state: State, time: Any) -> list[tuple[Array, Array | None]]:
+        parts = _parts(scene, setup, state, time)
+        given = {id(e): of_user for e, of_user in zip(setup.effects, phase.effects, strict=True)}
+        who.extend(given.get(id(part.who), part.who) for part in parts)
+        return [(part.value, part.shift) for part in parts]
+
+    # traced, as effects are in use: one that only works so must not fail here
+    found = jax.tree.map(np.asarray, jax.jit(arrays)(setup, state, time))
+    length = np.asarray(setup.rod.lengths).sum(axis=0)[0]
+    strongest, most, overflow = None, 0.0, False
+    for culprit, (value, shift) in zip(who, found, strict=True):
+        bad = ~np.isfinite(value)
+        overflow = bool(bad.any())
+        if overflow and culprit is not None:
+            place = _place(_by_point(bad, len(state.positions)))
+            fault = "gives values that are not finite there"
+            return Cause(place, f"{_name(culprit)} {fault}; {_advice(culprit)}")
+        if overflow:
+            break
+        if shift is not None and (share := float((shift / length).max())) > most:
+            strongest, most = culprit, share
+    place = _place(wrong)
+    if strongest is not None and (most > 1 or overflow):
+        times = f"{most:.2g} times" if np.isfinite(most) else "far more than"
+        text = f"moves a point by {times} its strand's length in one step"
+        return Cause(place, f"{_name(strongest)} {text}; {_advice(strongest)}")
+    fault = "gives values that are not finite"
+    if runs_away:
+        fault = "moves a point by more than its strand's length in one step"
+    advice = _advice(scene.solver, scene.fibre, scene.bonds, scene.strands)
+    return Cause(place, f"the solver, {_name(scene.solver)}, {fault}; {advice}")
 
 
-def _parts(setup: Setup, state: State, time: Any) -> Iterator[tuple[str, Any]]:
-    """What each effect gives in a step, by the name of its class, in the step's order."""
+def _parts(scene: Scene, setup: Setup, state: State, time: Any) -> list[Part]:
+    """What each part of a step, or of its first substep, gives, in the step's order."""
     rod, effects, dt = setup.rod, setup.effects, setup.dt
+    parts = [
+        Part(e, e.scaled(jnp.ones_like(rod.stiffness))) for e in of_kind(effects, StiffnessEffect)
+    ]
     for bond in of_kind(effects, BondEffect):
-        fractions, rises = changes([bond], rod, state, dt)
-        yield type(bond).__name__, fractions.sum(axis=1) + sum(rises.values())
+        for kind in (*bond.kinds_cut, *bond.kinds_formed):
+            before = state.fractions[:, BONDS.index(kind)]
+            parts.append(Part(bond, bond.fraction_change(kind, before, rod, state, dt)))
+    if poses := of_kind(effects, PoseEffect):
+        return [*parts, *(Part(e, x) for e in poses for x in e.pose(rod, state))]
     p, q, v = state.positions, state.orientations, state.velocities
     for force in of_kind(effects, VelocityEffect):
-        dv = force.velocity_change(rod, state, dt)
-        yield type(force).__name__, dv
-        v = v + dv
+        change = force.velocity_change(rod, state, dt)
+        # drag, large where the velocity is, makes nothing faster
+        faster = _size(state.velocities + change) - _size(state.velocities)
+        shift = dt * jnp.where(rod.point_weights[:, 0] > 0, faster, 0)
+        parts.append(Part(force, jnp.broadcast_to(change, v.shape), shift))
+        v = v + change
+    dt = dt / setup.solver.substeps
     p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
+    parts.append(Part(None, p))
     for holding in of_kind(effects, HoldingEffect):
-        p, q = holding.moved(rod, p, q, time, dt)
-        yield type(holding).__name__, jnp.where(jnp.isfinite(p), 0, p)
+        before, (p, q) = p, holding.moved(rod, p, q, time, dt)
+        parts += [Part(holding, p, _size(p - before)), Part(holding, q)]
     for obstacle in of_kind(effects, PositionEffect):
-        p = obstacle.projected(rod, p, state.positions, time, dt)
-        yield type(obstacle).__name__, jnp.where(jnp.isfinite(p), 0, p)
+        before, p = p, obstacle.projected(rod, p, state.positions, time, dt)
+        parts.append(Part(obstacle, p, _size(p - before)))
+    shape = rest_shape(state.shapes, state.fractions, rod.influence, relative(q[:-1], q[1:]))
+    return [*parts, Part(scene.bonds, shape)]
+
+
+def _size(x: Array) -> Array:
+    """The largest component of vectors (points, 3, strands): a norm whose squares fit."""
+    return jnp.max(jnp.abs(x), axis=1)
+
+
+def _name(who: Any) -> str:
+    return type(who).__name__[:60]
+
+
+def _advice(*whose: Any) -> str:
+    """What to change in the first of them: what its constructor refuses, else what its class is
+    known for."""
+    for who in whose:
+        try:
+            replace(who)
+        except ValueError as error:
+            return str(error)
+        except Exception:  # a constructor of the user's
+            continue
+    for kind in type(whose[0]).__mro__:
+        if kind.__name__ in ADVICE:
+            return ADVICE[kind.__name__]
+    return "look at what it returns there"
+
+
+def _wrong(state: State) -> np.ndarray:
+    """Where a number of a state is not finite, shape (points, strands)."""
+    points = len(state.positions)
+    masks = [_by_point(~np.isfinite(np.asarray(x)), points) for x in jax.tree.leaves(state)]
+    return np.logical_or.reduce(masks)
+
+
+def _runs_away(setup: Setup, before: State, after: State) -> np.ndarray:
+    """Where a free point moves by more than its strand's length in a step, shape (points, strands).
+
+    In a pose that an effect prescribes it may.
+    """
+    moved = np.asarray(_size(after.positions - before.positions))
+    rod, free = setup.rod, not of_kind(setup.effects, PoseEffect)
+    far: np.ndarray = moved > np.asarray(rod.lengths).sum(axis=0)[0]
+    return far & (np.asarray(rod.point_weights)[:, 0] > 0) & free
+
+
+def _by_point(wrong: np.ndarray, points: int) -> np.ndarray:
+    """By point and strand what is by point, by edge (of its second point) or by inner point."""
+    rows = np.logical_or.reduce(wrong, axis=tuple(range(1, wrong.ndim - 1)))
+    above = (points - len(rows) + 1) // 2
+    return np.pad(rows, ((above, points - len(rows) - above), (0, 0)))
+
+
+def _place(wrong: np.ndarray) -> str:
+    """The first strand, and the first point of it, of shape (points, strands)."""
+    strand = int(np.argmax(wrong.any(axis=0)))
+    return f"strand {strand}, point {int(np.argmax(wrong[:, strand]))}"

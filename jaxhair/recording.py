@@ -1,7 +1,6 @@
 """Simulating a whole scene and recording frames of it."""
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -13,8 +12,8 @@ import numpy as np
 from jax import Array, lax
 
 from jaxhair import check, diagnosis
-from jaxhair.checkpoints import Checkpoints, named, unnamed
 from jaxhair.pytree import pytree, static
+from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
 from jaxhair.simulate import Setup, advance, prepare, start, step
 from jaxhair.strands import State
@@ -88,14 +87,15 @@ def simulate(
         observe: what to keep of a state, a function from `State` to any pytree of arrays.
         progress: show a progress bar on stderr.
         checkpoint: a folder in which frames are kept as the work goes on. The same call with the
-            same scene goes on from there, however the work ended, to the same frames bit for bit.
+            same scene goes on from there, however the work ended, to the same frames bit for bit
+            (on the same kind of machine). One process at a time may use it.
         checkpoint_seconds: wall time between two writes to it [s].
 
     Ctrl-C ends the simulation and returns the frames so far, with `complete` False. Under a JAX
     transformation all frames are computed in one traced program, and nothing is shown or kept.
 
-    Raises ValueError for fps that are not above 0 and for a checkpoint of other work, and
-    NotFinite if values became NaN or infinite.
+    Raises ValueError for fps that are not above 0 and for a checkpoint that is of other work or
+    damaged, and NotFinite at the first frame with values that are NaN or infinite.
     """
     check.instance("scene", scene, Scene)
     check.flag("progress", progress)
@@ -111,19 +111,22 @@ def simulate(
             )
         observed = _traced(numbers, observe, every)
         return Recording(scene, jnp.asarray(times, scene.dtype), observed, tuple(names))
-    saver = _Saver(checkpoint, float(checkpoint_seconds), numbers, observe, every)
-    frames, complete, failure = _interruptible(numbers, observe, every, progress, saver)
+    saved = _saved_frames(checkpoint, float(checkpoint_seconds), numbers, observe, every)
+    frames, complete, failure = _interruptible(numbers, observe, every, progress, saved)
     n = len(frames)
     recording = Recording(
-        scene,
-        np.asarray(times[:n]),
-        jax.tree.map(lambda *x: np.stack(x), *frames),
-        tuple(names[:n]),
-        complete,
+        scene, np.asarray(times[:n]), _stacked(frames, observe, numbers), tuple(names[:n]), complete
     )
     if failure is not None:
-        raise NotFinite(_message(n, times[n], names[n], failure), recording)
+        raise NotFinite(_message(scene, observe, n, times[n], names[n], failure), recording)
     return recording
+
+
+def _stacked(frames: list[Any], observe: Callable[[State], Any], scene: Scene) -> Any:
+    if frames:
+        return jax.tree.map(lambda *x: np.stack(x), *frames)
+    one = jax.eval_shape(observe, start(scene))
+    return jax.tree.map(lambda x: np.empty((0, *x.shape), x.dtype), one)
 
 
 def _frame_steps(phase: Phase, every: int, dt: float) -> list[int]:
@@ -168,8 +171,8 @@ _prepare = jax.jit(prepare)
 @partial(jax.jit, static_argnums=0)
 def _frame(
     observe: Callable[[State], Any], setup: Setup, state: State, first: Array, steps: Array
-) -> tuple[State, Any]:
-    """`steps` steps and what is observed then.
+) -> tuple[State, Any, Array]:
+    """`steps` steps, what is observed then, and whether every number of the state is finite.
 
     The number of steps is not static, so that all frames of all phases with the same effects
     share one compiled program; it is a `while` loop, which has no reverse mode and needs none here.
@@ -179,62 +182,47 @@ def _frame(
         return step(setup, state, number.astype(state.positions.dtype) * setup.dt)
 
     state = lax.fori_loop(first, first + steps, one, state)
-    return state, observe(state)
+    finite = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
+    return state, observe(state), jnp.stack(finite).all()
 
 
-class _Saver:
-    """Keeps frames in a checkpoint's folder, and what was kept there before; or keeps nothing."""
-
-    def __init__(
-        self,
-        folder: str | os.PathLike[str] | None,
-        seconds: float,
-        scene: Scene,
-        observe: Callable[[State], Any],
-        every: int,
-    ) -> None:
-        self._seconds, self._last = seconds, time.monotonic()
-        self._folder: Checkpoints | None = None
-        self.frames: list[Any] = []
-        self.state: State = start(scene)
-        self._written = 0
-        if folder is None:
-            return
-        name = f"{getattr(observe, '__module__', '')}.{getattr(observe, '__qualname__', observe)}"
-        self._folder = Checkpoints(folder, {"scene": scene, name: every})
-        like = jax.eval_shape(observe, self.state)
-        for part in self._folder.parts:
-            stacked = unnamed("observed", part, like)
-            count = len(jax.tree.leaves(stacked)[0])
-            self.frames += [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(count)]
-            self.state = jax.tree.map(jnp.asarray, unnamed("state", part, self.state))
-        self._written = len(self.frames)
-
-    def keep(self, frames: list[Any], state: State, *, now: bool = False) -> None:
-        """Writes the frames that are not written yet, and the state after the last one, if it is
-        time for it."""
-        due = now or time.monotonic() - self._last >= self._seconds
-        if self._folder is None or not due or len(frames) == self._written:
-            return
-        stacked = jax.tree.map(lambda *x: np.stack(x), *frames[self._written :])
-        self._folder.add({**named("observed", stacked), **named("state", state)})
-        self._written, self._last = len(frames), time.monotonic()
+def _saved_frames(
+    folder: str | os.PathLike[str] | None,
+    seconds: float,
+    scene: Scene,
+    observe: Callable[[State], Any],
+    every: int,
+) -> SavedFrames:
+    """What a checkpoint's folder has of this simulation."""
+    state, work, observed = start(scene), None, None
+    if folder is not None:
+        # The programs tell apart what the numbers do not: other effects or another `observe` of
+        # the same name, and another state of this package.
+        at, bare, programs = jnp.int32(0), replace(scene, phases=()), []
+        for phase in scene.phases:
+            setup = _prepare(bare, phase.effects)
+            programs.append(_frame.lower(observe, setup, state, at, at).as_text())
+        observed = jax.eval_shape(observe, state)
+        work = {"scene": scene, "steps": every, "programs": programs, "observed": str(observed)}
+    return SavedFrames(folder, seconds, work, state, observed)
 
 
-Failure = tuple[Scene, Phase, Setup, State, int, int]
-"""Arguments of `jaxhair.diagnosis.cause`."""
+Failure = tuple[Phase | None, Setup | None, State, int, int]
+"""Of `jaxhair.diagnosis.cause`: phase and setup, state before, first step and number of steps."""
 
 
 def _interruptible(
-    scene: Scene, observe: Callable[[State], Any], every: int, progress: bool, saver: _Saver
+    scene: Scene, observe: Callable[[State], Any], every: int, progress: bool, saved: SavedFrames
 ) -> tuple[list[Any], bool, Failure | None]:
     """Frame by frame, with a progress bar, until the end, Ctrl-C or a value that is not finite."""
     total = sum(phase.steps(scene.dt) for phase in scene.phases)
     bar = _bar(total, progress)
     bare = replace(scene, phases=())
-    frames = saver.frames or [jax.tree.map(np.asarray, observe(saver.state))]
+    frames = saved.frames or [jax.tree.map(np.asarray, observe(saved.state))]
     # how many frames, and the state after them, in one object: Ctrl-C may come at any statement
-    kept = (len(frames), saver.state)
+    kept = (len(frames), saved.state)
+    if not _finite((frames[0], saved.state)):
+        return [], False, (None, None, saved.state, 0, 0)
     number = 0
     try:
         for phase in scene.phases:
@@ -244,32 +232,29 @@ def _interruptible(
                 if number >= kept[0]:
                     setup = setup or _prepare(bare, phase.effects)
                     before = kept[1]
-                    state, observed = _frame(
+                    state, observed, sound = _frame(
                         observe, setup, before, jnp.int32(first), jnp.int32(steps)
                     )
                     frame = jax.tree.map(np.asarray, observed)
-                    if not _finite(frame):
-                        return frames, False, (scene, phase, setup, before, first, steps)
+                    if not (sound and _finite(frame)):
+                        return frames[: kept[0]], False, (phase, setup, before, first, steps)
                     del frames[kept[0] :]
                     frames.append(frame)
                     kept = (len(frames), state)
-                    saver.keep(frames, state)
+                    saved.save(frames, state)
                 first += steps
                 bar.update(steps)
     except KeyboardInterrupt:
         return frames[: kept[0]], False, None
     finally:
-        saver.keep(frames[: kept[0]], kept[1], now=True)
+        saved.save(frames[: kept[0]], kept[1], now=True)
         bar.close()
     return frames, True, None
 
 
-def _finite(frame: Any) -> bool:
-    return all(
-        bool(np.isfinite(leaf).all())
-        for leaf in jax.tree.leaves(frame)
-        if np.issubdtype(leaf.dtype, np.inexact)
-    )
+def _finite(tree: Any) -> bool:
+    leaves = (np.asarray(leaf) for leaf in jax.tree.leaves(tree))
+    return all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
 
 
 class _NoBar:
@@ -286,14 +271,27 @@ def _bar(total: int, progress: bool) -> Any:
     return tqdm(total=total, unit="step", desc="simulating")
 
 
-def _message(frame: int, seconds: float, phase: str, failure: Failure) -> str:
-    """What NotFinite says, in one line."""
+def _message(
+    scene: Scene,
+    observe: Callable[[State], Any],
+    frame: int,
+    seconds: float,
+    phase: str,
+    failure: Failure,
+) -> str:
+    """What NotFinite says, in one line of less than 500 characters."""
+    of_phase, setup, state, first, steps = failure
+
+    def one(state: State, number: int) -> State:  # the same program, so the same numbers
+        assert setup is not None
+        return _frame(observe, setup, state, jnp.int32(number), jnp.int32(1))[0]
+
     try:
-        place, reason = diagnosis.cause(*failure)
+        place, reason = diagnosis.cause(scene, of_phase, setup, state, one, first, steps)
     except Exception as error:  # the failure itself must be heard of, whatever else fails
         place, reason = "", f"its cause was not found ({type(error).__name__})"
     where = f", {place}" if place else ""
-    return (
-        f"values are not finite from frame {frame} on (t = {seconds:g} s, phase {phase!r}{where}): "
-        f"{reason or 'its cause was not found'}; the frames before are in this error's .recording"
-    )
+    start = f"values are not finite from frame {frame} on (t = {seconds:g} s, phase {phase!r}"
+    end = "the frames before are in this error's .recording"
+    room = max(499 - len(start + where + end) - len("): ; "), 60)
+    return f"{start}{where}): {' '.join(reason.split())[:room]}; {end}"

@@ -10,7 +10,13 @@ import pytest
 import jaxhair as jh
 from jaxhair import diagnosis
 from jaxhair.__main__ import main
-from jaxhair.effects import VelocityEffect
+from jaxhair.effects import (
+    BondEffect,
+    PoseEffect,
+    PositionEffect,
+    StiffnessEffect,
+    VelocityEffect,
+)
 
 DT = 1 / 360
 SOLVERS = [jh.PositionBased(), jh.Compliant(), jh.Direct()]
@@ -64,36 +70,161 @@ def test_an_effect_of_the_users(solver: Any) -> None:
     np.testing.assert_array_equal(kept.positions, whole.positions[:3])
 
 
+@jh.pytree
+class BreaksLater(PositionEffect):
+    """NaN at point 2 of strand 1 from a time within the phase on."""
+
+    since: Any
+
+    def projected(self, rod: Any, positions: Any, previous: Any, time: Any, dt: float) -> Any:
+        point, strand = (jnp.arange(positions.shape[axis]) for axis in (0, 2))
+        here = (point == 2)[:, None, None] & (strand == 1)[None, None, :]
+        return jnp.where(here & (time >= self.since), jnp.nan, positions)
+
+
 @EACH
+def test_an_effect_that_breaks_after_a_while(solver: Any) -> None:
+    """In the tenth step, in the second frame of its phase: among five that are repeated."""
+    text, kept = failure(scene(BreaksLater(8.5 * DT), solver=solver))
+    assert "from frame 4 on" in text
+    assert "phase 'wild', strand 1, point 2): BreaksLater gives" in text
+    assert len(kept.times) == 4
+    assert np.isfinite(kept.positions).all()
+
+
+@jh.pytree
+class BadPose(PoseEffect):
+    """NaN at point 3. It moves all points far, which is no fault of a pose."""
+
+    def pose(self, rod: Any, state: jh.State) -> Any:
+        p = state.positions.at[3].set(jnp.nan) + jnp.asarray(9.0, state.positions.dtype)
+        return p, state.orientations
+
+
+@jh.pytree
+class BadBond(BondEffect):
+    """NaN at the second inner point."""
+
+    kinds_cut = ("hydrogen",)
+    kinds_formed = ()
+
+    def fraction_change(self, kind: str, fraction: Any, rod: Any, state: Any, dt: float) -> Any:
+        return jnp.zeros_like(fraction).at[1].set(jnp.nan)
+
+
+@jh.pytree
+class BadStiffness(StiffnessEffect):
+    """NaN at the last inner point."""
+
+    def scaled(self, stiffness: Any) -> Any:
+        return stiffness.at[-1].set(jnp.nan)
+
+
 @pytest.mark.parametrize(
-    ("effect", "words"),
-    [
-        (jh.Gravity((0.0, 0.0, -1e18)), "Gravity|smaller acceleration"),
-        (jh.HairContact(1e-3, 1e18), "HairContact|smaller strength"),
-        (jh.Wind((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), 1e18), "Wind|smaller strength"),
-    ],
-    ids=["gravity", "contact", "wind"],
+    ("effect", "point"), [(BadPose(), 3), (BadBond(), 2), (BadStiffness(), 4)], ids=str
 )
-def test_effects_of_absurd_strength(effect: Any, words: str, solver: Any) -> None:
-    """Named where they break the values; or the run stays finite, as some solvers make it."""
-    text = ""
-    try:
-        movie = jh.simulate(scene(effect, solver=solver), fps=72)
-    except jh.NotFinite as error:
-        text = str(error)
-    if not text:
-        assert np.isfinite(movie.positions).all()
-        return
-    for word in words.split("|"):
-        assert word in text
+def test_effects_of_other_kinds(effect: Any, point: int) -> None:
+    text, _ = failure(scene(effect, solver=jh.Direct()))
+    name = type(effect).__name__
+    assert f"strand 0, point {point}): {name} gives values that are not finite there" in text
+
+
+@jh.pytree
+class Snaps(jh.PositionBased):
+    """A solver that turns the third edge of strand 1 into NaN."""
+
+    def solve(self, *arguments: Any) -> Any:
+        p, q, none = super().solve(*arguments)
+        return p, q.at[2, :, 1].set(jnp.nan), none
+
+
+def test_a_solver() -> None:
+    """It has the advice of the solver that it derives from; an edge is named by its far point."""
+    text, _ = failure(scene(solver=Snaps()))
+    assert "strand 1, point 3): the solver, Snaps, gives values that are not finite" in text
+    assert "take more iterations" in text
+
+
+@jh.pytree
+class Kicks(VelocityEffect):
+    """A speed [m/s] along z."""
+
+    speed: Any
+
+    def velocity_change(self, rod: Any, state: jh.State, dt: float) -> Any:
+        return jnp.zeros_like(state.velocities).at[:, 2].set(self.speed)
+
+
+@jh.pytree
+class KicksMore(Kicks):
+    """Another one."""
+
+
+def test_effects_that_are_finite_each_but_not_together() -> None:
+    """The sum overflows: the strongest is named."""
+    text, kept = failure(scene(KicksMore(3e38), Kicks(2e38)))
+    assert "KicksMore moves a point by 8.3e+36 times its strand's length in one step" in text
+    assert len(kept.times) == 3
+
+
+@pytest.mark.parametrize(
+    ("effect", "leaf", "solver"),
+    [
+        (None, "Gravity.acceleration", SOLVERS[2]),
+        (jh.HairContact(1e-3, 1.0), "HairContact.strength", SOLVERS[0]),
+        (jh.HairContact(1e-3, 1.0), "HairContact.strength", SOLVERS[1]),
+        (jh.Wind((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), 1.0), "Wind.strength", SOLVERS[2]),
+    ],
+)
+def test_effects_of_absurd_strength(effect: Any, leaf: str, solver: Any) -> None:
+    """Stronger than constructors let pass, and near what float32 holds."""
+    absurd = scene(*([effect] if effect else []), solver=solver)
+    strength = np.array(3e38) if effect else np.array([0, 0, -3e38])
+    text, _ = failure(jh.replace_leaves(absurd, {f"phases.wild.{leaf}": strength}))
+    assert f"{leaf.partition('.')[0]} moves a point by" in text
+    assert f"{leaf} has the value {'' if effect else '-'}3e+38" in text
+    assert "it must be finite, and at most 1e+18" in text
 
 
 def test_a_number_that_is_not_finite() -> None:
     for name in ("fibre.stiffness", "phases.wild.Drag.time"):
         text, kept = failure(jh.replace_leaves(scene(), {name: float("nan")}))
-        assert f"{name} has the value nan" in text
+        assert f"strand 0, point 0): {name} has the value nan; it must be finite" in text
         assert ("phase 'wild'" in text) == name.startswith("phases")
         assert len(kept.times) >= 1
+
+
+def test_a_number_that_a_constructor_would_refuse() -> None:
+    """It is finite, and what comes of it is not."""
+    text, _ = failure(jh.replace_leaves(scene(), {"bonds.influence": np.zeros(4)}))
+    assert "bonds.influence is [0.0, 0.0, 0.0, 0.0]; its sum must be above 0" in text
+
+
+def test_a_start_that_is_not_finite() -> None:
+    """No frame is good; with or without phases."""
+    positions = np.array(scene().strands.positions)
+    positions[1, 3, 0] = np.nan
+    bad = jh.replace_leaves(scene(), {"strands.positions": positions})
+    for each in (bad, jh.Scene(bad.strands)):
+        text, kept = failure(each)
+        assert "from frame 0 on (t = 0 s, phase '', strand 1, point 3)" in text
+        assert "strands.positions has the value nan at (1, 3, 0)" in text
+        assert kept.positions.shape == (0, 2, 6, 3)
+
+
+def test_a_state_that_is_not_finite_though_what_is_observed_is() -> None:
+    text, kept = failure(scene(Breaks(1, 4)), observe=lambda state: state.positions[0, :, 0])
+    assert "from frame 3 on" in text
+    assert "strand 1, point 4): Breaks" in text
+    assert len(kept.observed) == 3
+
+
+def test_an_observation_that_is_not_finite_though_the_state_is() -> None:
+    def mean_height(state: jh.State) -> Any:
+        return jnp.log(state.positions[-1, 2, 0] + 0.08)
+
+    text, _ = failure(scene(jh.Gravity((0.0, 0.0, -1e4))), observe=mean_height)
+    assert "what `observe` returns is not finite, though all of the state is" in text
 
 
 def test_a_diagnosis_that_fails_hides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,7 +243,9 @@ def test_the_command_keeps_the_frames_before(
     path = tmp_path / "broken.npz"
     assert main(["simulate", "perm", "--fps", "72", "--quiet", "--output", str(path)]) == 1
     printed = capsys.readouterr()
-    assert printed.err.startswith("error: values are not finite from frame")
+    assert printed.err.startswith("error: values are not finite from frame 3")
+    assert printed.err.count("\n") == 1
+    assert "broken.npz: 3 frames before the failure" in printed.out
     with np.load(path) as arrays:
         assert np.isfinite(arrays["positions"]).all()
         assert len(arrays["positions"]) >= 3
