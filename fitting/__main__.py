@@ -46,18 +46,23 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument(
         "--checkpoint",
         metavar="DIR",
-        help="keep the work in this folder meanwhile; the same command goes on from there if it "
-        "was interrupted",
+        help="keep the work in this folder as it goes on: however it is interrupted, the same "
+        "command goes on from there, to the same result. Delete it when all is done",
     )
     top.add_argument("--quiet", action="store_true", help="show no progress")
     return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the fit; returns 0, or 1 if it did not converge, or 2 after a mistake in the request."""
+    """Runs the fit; returns 0, or 1 if it did not converge, or 2 after a mistake in the request,
+    or 130 after Ctrl-C."""
     options = parsed(parser(), arguments)
     try:
         return _fit(options)
+    except KeyboardInterrupt:
+        kept = f"; the same command goes on from {options.checkpoint}"
+        print(f"interrupted{kept if options.checkpoint else ''}", file=sys.stderr)
+        return 130
     except (ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

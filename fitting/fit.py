@@ -88,6 +88,10 @@ class Problem:
             states = {name: part[f"state {name}"] for name in self.targets}
             self._known[part["point"].tobytes()] = (part["residuals"], part["jacobian"], states)
 
+    def program(self) -> str:
+        """The compiled program, as text."""
+        return str(self._evaluate.lower(self.start).as_text())
+
     @property
     def size(self) -> int:
         """Number of residuals that come from the data."""
@@ -181,9 +185,11 @@ def fit(
             the start, and hardly moves what they do: 3 is a factor of 20 in a positive number.
         progress: called with the number of simulations so far and the residual [mm].
         checkpoint: a folder in which the work is kept as it goes on. The same fit goes on from
-            there, however it ended, to the same result bit for bit.
+            there, however it ended, to the same result bit for bit (on the same kind of machine).
+            One process at a time may use it.
 
-    Raises ValueError for an unknown phase, leaf or method.
+    Raises ValueError for an unknown phase, leaf or method, and for a checkpoint that is of other
+    work or damaged.
     """
     check.choice("method", method, METHODS)
     check.whole("steps", steps, least=1)
@@ -209,7 +215,7 @@ def fit(
     }
     journal = None
     if checkpoint is not None:
-        journal = Checkpoints(checkpoint, _work(problem, settings, learning_rate))
+        journal = Checkpoints(checkpoint, _work(problem, {**settings, "rate": learning_rate}))
     begin = time.perf_counter()
     if method == "levenberg-marquardt":
         if journal is not None:
@@ -223,15 +229,18 @@ def fit(
     return _result(problem, best, taken, converged, seconds, noise_mm, settings)
 
 
-def _work(problem: Problem, settings: dict[str, Any], learning_rate: float) -> Any:
+def _work(problem: Problem, settings: dict[str, Any]) -> Any:
     """All that a fit's result depends on."""
     scene = problem.parameters.scene
-    wanted = {
-        name: target.points(problem.lengths, scene.strands.count)
-        for name, target in problem.targets.items()
+    wanted = [t.points(problem.lengths, scene.strands.count) for t in problem.targets.values()]
+    return {
+        "scene": scene,
+        "wanted": wanted,
+        "states": repr([(name, t.align) for name, t in problem.targets.items()]),
+        "settings": repr(settings),
+        # tells apart what the numbers do not: another effect, target or constraint of the same name
+        "program": problem.program(),
     }
-    kinds = {name: (type(t).__name__, t.align) for name, t in problem.targets.items()}
-    return {f"{settings} {kinds} {learning_rate}": (scene, wanted)}
 
 
 def _levenberg_marquardt(

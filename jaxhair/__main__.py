@@ -61,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--checkpoint",
         metavar="DIR",
-        help="keep frames in this folder meanwhile; the same command goes on from there if it was "
-        "interrupted",
+        help="keep the frames in this folder every 10 seconds: however the work is interrupted, "
+        "the same command goes on from there, to the same frames. Delete it when all is done",
     )
     run.add_argument("--quiet", action="store_true", help="show no progress")
     accuracy.add_command(commands)
@@ -167,7 +167,7 @@ def _simulate(options: argparse.Namespace) -> int:
     check_ending(options.output)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
-    failure: NotFinite | None = None
+    failed = False
     try:
         recording = simulate(
             _scene(options),
@@ -176,20 +176,27 @@ def _simulate(options: argparse.Namespace) -> int:
             checkpoint=options.checkpoint,
         )
     except NotFinite as error:
-        failure, recording = error, error.recording
+        failed, recording = True, error.recording
         print(f"error: {error}", file=sys.stderr)
-    if not recording.complete and failure is None:
-        print(f"interrupted: {len(recording.phases)} frames are kept", file=sys.stderr)
-    save(
-        options.output,
-        recording,
-        color_by=options.color_by,
-        overwrite=options.overwrite,
-        progress=not options.quiet,
-        size=(options.size, options.size),
-    )
-    print(f"{options.output}: {len(recording.phases)} frames, {recording.times[-1]:.2f} s")
-    if failure is not None:
+    frames = len(recording.phases)
+    if not recording.complete and not failed:
+        if options.checkpoint is not None:  # an output would keep the same command from going on
+            rest = f"in {options.checkpoint}; the same command goes on from there"
+            print(f"interrupted: {frames} frames are kept {rest}", file=sys.stderr)
+            return 130
+        print(f"interrupted: {frames} frames are kept", file=sys.stderr)
+    if frames > 0:
+        save(
+            options.output,
+            recording,
+            color_by=options.color_by,
+            overwrite=options.overwrite,
+            progress=not options.quiet,
+            size=(options.size, options.size),
+        )
+        before = " before the failure" if failed else ""
+        print(f"{options.output}: {frames} frames{before}, {recording.times[-1]:.2f} s")
+    if failed:
         return 1
     return 0 if recording.complete else 130
 
