@@ -186,16 +186,24 @@ def _simulate(options: argparse.Namespace) -> int:
             return 130
         print(f"interrupted: {frames} frames are kept", file=sys.stderr)
     if frames > 0:
-        save(
-            options.output,
-            recording,
-            color_by=options.color_by,
-            overwrite=options.overwrite,
-            progress=not options.quiet,
-            size=(options.size, options.size),
+        try:
+            save(
+                options.output,
+                recording,
+                color_by=options.color_by,
+                overwrite=options.overwrite,
+                progress=not options.quiet,
+                size=(options.size, options.size),
+            )
+        except (ValueError, OSError, ImportError) as error:
+            if not failed:
+                raise
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+        before, stream = (" before the failure", sys.stderr) if failed else ("", sys.stdout)
+        print(
+            f"{options.output}: {frames} frames{before}, {recording.times[-1]:.2f} s", file=stream
         )
-        before = " before the failure" if failed else ""
-        print(f"{options.output}: {frames} frames{before}, {recording.times[-1]:.2f} s")
     if failed:
         return 1
     return 0 if recording.complete else 130

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxhair.bonds import rest_shape
+from jaxhair.bonds import changes, rest_shape
 from jaxhair.effects import (
     BondEffect,
     HoldingEffect,
@@ -21,7 +21,7 @@ from jaxhair.effects import (
 )
 from jaxhair.quaternion import relative
 from jaxhair.scene import Phase, Scene, named_leaves
-from jaxhair.simulate import Setup
+from jaxhair.simulate import Setup, moved
 from jaxhair.strands import BONDS, State
 
 ADVICE = {
@@ -129,15 +129,19 @@ def _blame(
 ) -> Cause:
     """Who made a step go wrong: the first that gives what is not finite, else the strongest."""
     who: list[Any] = []
+    start = state
+    state, time, wrong = _bad_substep(setup, start, time, wrong)
 
-    def arrays(setup: Setup, state: State, time: Any) -> list[tuple[Array, Array | None]]:
-        parts = _parts(scene, setup, state, time)
+    def arrays(
+        setup: Setup, start: State, state: State, time: Any
+    ) -> list[tuple[Array, Array | None]]:
+        parts = _parts(scene, setup, start, state, time)
         given = {id(e): of_user for e, of_user in zip(setup.effects, phase.effects, strict=True)}
         who.extend(given.get(id(part.who), part.who) for part in parts)
         return [(part.value, part.shift) for part in parts]
 
     # traced, as effects are in use: one that only works so must not fail here
-    found = jax.tree.map(np.asarray, jax.jit(arrays)(setup, state, time))
+    found = jax.tree.map(np.asarray, jax.jit(arrays)(setup, start, state, time))
     length = np.asarray(setup.rod.lengths).sum(axis=0)[0]
     strongest, most, overflow = None, 0.0, False
     for culprit, (value, shift) in zip(who, found, strict=True):
@@ -149,8 +153,11 @@ def _blame(
             return Cause(place, f"{_name(culprit)} {fault}; {_advice(culprit)}")
         if overflow:
             break
-        if shift is not None and (share := float((shift / length).max())) > most:
-            strongest, most = culprit, share
+        if shift is not None:
+            with np.errstate(over="ignore"):
+                share = float((shift.astype("float64") / length).max())
+            if share > most:
+                strongest, most = culprit, share
     place = _place(wrong)
     if strongest is not None and (most > 1 or overflow):
         times = f"{most:.2g} times" if np.isfinite(most) else "far more than"
@@ -163,26 +170,57 @@ def _blame(
     return Cause(place, f"the solver, {_name(scene.solver)}, {fault}; {advice}")
 
 
-def _parts(scene: Scene, setup: Setup, state: State, time: Any) -> list[Part]:
-    """What each part of a step, or of its first substep, gives, in the step's order."""
+def _bad_substep(
+    setup: Setup, start: State, time: Any, wrong: np.ndarray
+) -> tuple[State, Any, np.ndarray]:
+    """The substep in which a step goes wrong: the state before it, its time and what is wrong."""
+    state, n = start, setup.solver.substeps
+    if n == 1 or of_kind(setup.effects, PoseEffect):  # a pose is taken in one go
+        return state, time, wrong
+    for number in range(n):
+        at = time + number * (setup.dt / n)
+        after = _substep(setup, start, state, at)
+        if (bad := _wrong(after) | _runs_away(setup, start, after)).any():
+            return state, at, bad
+        state = after
+    return start, time, wrong  # it is the bonds that re-form at the step's end
+
+
+@jax.jit
+def _substep(setup: Setup, start: State, state: State, time: Any) -> State:
+    """The state after a substep, given the state at the start of its step too."""
+    rod, effects, dt, n = setup.rod, setup.effects, setup.dt, setup.solver.substeps
+    fractions, _ = changes(of_kind(effects, BondEffect), rod, start, dt)
+    change = [e.velocity_change(rod, start, dt) / n for e in of_kind(effects, VelocityEffect)]
+    return moved(setup, replace(state, fractions=fractions), change, time, dt / n)
+
+
+def _parts(scene: Scene, setup: Setup, start: State, state: State, time: Any) -> list[Part]:
+    """What each part of a step gives, in the step's order.
+
+    Arguments:
+        start: of the step. state, time: of the substep looked at.
+    """
     rod, effects, dt = setup.rod, setup.effects, setup.dt
     parts = [
         Part(e, e.scaled(jnp.ones_like(rod.stiffness))) for e in of_kind(effects, StiffnessEffect)
     ]
     for bond in of_kind(effects, BondEffect):
         for kind in (*bond.kinds_cut, *bond.kinds_formed):
-            before = state.fractions[:, BONDS.index(kind)]
-            parts.append(Part(bond, bond.fraction_change(kind, before, rod, state, dt)))
+            before = start.fractions[:, BONDS.index(kind)]
+            parts.append(Part(bond, bond.fraction_change(kind, before, rod, start, dt)))
+    fractions, _ = changes(of_kind(effects, BondEffect), rod, start, dt)
+    state = replace(state, fractions=fractions)
     if poses := of_kind(effects, PoseEffect):
         return [*parts, *(Part(e, x) for e in poses for x in e.pose(rod, state))]
     p, q, v = state.positions, state.orientations, state.velocities
     for force in of_kind(effects, VelocityEffect):
-        change = force.velocity_change(rod, state, dt)
+        change = force.velocity_change(rod, start, dt)
         # drag, large where the velocity is, makes nothing faster
-        faster = _size(state.velocities + change) - _size(state.velocities)
+        faster = _size(start.velocities + change) - _size(start.velocities)
         shift = dt * jnp.where(rod.point_weights[:, 0] > 0, faster, 0)
         parts.append(Part(force, jnp.broadcast_to(change, v.shape), shift))
-        v = v + change
+        v = v + change / setup.solver.substeps
     dt = dt / setup.solver.substeps
     p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
     parts.append(Part(None, p))

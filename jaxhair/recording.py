@@ -288,7 +288,8 @@ def _message(
 
     try:
         place, reason = diagnosis.cause(scene, of_phase, setup, state, one, first, steps)
-    except Exception as error:  # the failure itself must be heard of, whatever else fails
+    # the failure itself must be heard of, whatever else fails, and its frames kept after Ctrl-C
+    except (Exception, KeyboardInterrupt) as error:
         place, reason = "", f"its cause was not found ({type(error).__name__})"
     where = f", {place}" if place else ""
     start = f"values are not finite from frame {frame} on (t = {seconds:g} s, phase {phase!r}"

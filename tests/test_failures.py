@@ -1,5 +1,6 @@
 """When values become infinite or NaN: the error says where, when, by whom, and what to do."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,15 @@ def test_an_effect_that_breaks_after_a_while(solver: Any) -> None:
     assert np.isfinite(kept.positions).all()
 
 
+def test_an_effect_that_breaks_in_a_later_substep() -> None:
+    """In the second of four substeps: it is blamed and not the solver, and at its own point."""
+    solver = jh.Direct(substeps=4)
+    text, kept = failure(scene(BreaksLater(8.2 * DT), solver=solver))
+    assert "from frame 4 on" in text
+    assert "phase 'wild', strand 1, point 2): BreaksLater gives" in text
+    assert len(kept.times) == 4
+
+
 @jh.pytree
 class BadPose(PoseEffect):
     """NaN at point 3. It moves all points far, which is no fault of a pose."""
@@ -99,6 +109,24 @@ class BadPose(PoseEffect):
     def pose(self, rod: Any, state: jh.State) -> Any:
         p = state.positions.at[3].set(jnp.nan) + jnp.asarray(9.0, state.positions.dtype)
         return p, state.orientations
+
+
+@jh.pytree
+class PoseOfBonds(PoseEffect):
+    """NaN once no bond of the first inner point is left."""
+
+    def pose(self, rod: Any, state: jh.State) -> Any:
+        cut = state.fractions[0].sum() == 0
+        return state.positions.at[1].multiply(jnp.where(cut, jnp.nan, 1)), state.orientations
+
+
+CUT = jh.Cut(hydrogen=0.0, ionic=0.0, disulfide=0.0, peptide=0.0)
+
+
+def test_a_pose_under_bonds_that_break_in_the_same_step() -> None:
+    """It is judged by what it was given: the state after the cut. It knows no substeps."""
+    text, _ = failure(scene(PoseOfBonds(), CUT, solver=jh.PositionBased(substeps=3)))
+    assert "strand 0, point 1): PoseOfBonds gives values" in text
 
 
 @jh.pytree
@@ -161,10 +189,15 @@ class KicksMore(Kicks):
 
 
 def test_effects_that_are_finite_each_but_not_together() -> None:
-    """The sum overflows: the strongest is named."""
-    text, kept = failure(scene(KicksMore(3e38), Kicks(2e38)))
-    assert "KicksMore moves a point by 8.3e+36 times its strand's length in one step" in text
-    assert len(kept.times) == 3
+    """The sum overflows: the strongest is named, also where lengths are too short for the number
+    of them to fit into float32."""
+    both = scene(Kicks(2e38), KicksMore(3e38))
+    for size, times in ((1.0, "8.3e+36"), (5e-3, "1.7e+39")):
+        hair = both.strands
+        short = replace(hair, positions=size * hair.positions, lengths=size * hair.lengths)
+        text, kept = failure(replace(both, strands=short))
+        assert f"KicksMore moves a point by {times} times its strand's length in one step" in text
+        assert len(kept.times) == 3
 
 
 @pytest.mark.parametrize(
@@ -227,13 +260,19 @@ def test_an_observation_that_is_not_finite_though_the_state_is() -> None:
     assert "what `observe` returns is not finite, though all of the state is" in text
 
 
-def test_a_diagnosis_that_fails_hides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_diagnosis_that_fails_hides_nothing(
+    monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    """Neither does one that Ctrl-C ends."""
+
     def broken(*_: Any) -> Any:
-        raise RuntimeError
+        raise error
 
     monkeypatch.setattr(diagnosis, "cause", broken)
-    text, _ = failure(scene(Breaks(1, 4)))
-    assert "its cause was not found (RuntimeError)" in text
+    text, kept = failure(scene(Breaks(1, 4)))
+    assert f"its cause was not found ({error.__name__})" in text
+    assert len(kept.times) == 3
 
 
 def test_the_command_keeps_the_frames_before(
@@ -244,8 +283,26 @@ def test_the_command_keeps_the_frames_before(
     assert main(["simulate", "perm", "--fps", "72", "--quiet", "--output", str(path)]) == 1
     printed = capsys.readouterr()
     assert printed.err.startswith("error: values are not finite from frame 3")
-    assert printed.err.count("\n") == 1
-    assert "broken.npz: 3 frames before the failure" in printed.out
+    assert printed.err.count("\n") == 2
+    assert "broken.npz: 3 frames before the failure" in printed.err
+    assert printed.out == ""
     with np.load(path) as arrays:
         assert np.isfinite(arrays["positions"]).all()
         assert len(arrays["positions"]) >= 3
+
+
+def test_the_command_cannot_keep_the_frames_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both errors are told, and the code is that of the first."""
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("jaxhair.__main__._scene", lambda options: scene(Breaks(1, 4)))
+    monkeypatch.setattr("jaxhair.__main__.save", full)
+    path = tmp_path / "broken.npz"
+    assert main(["simulate", "perm", "--fps", "72", "--quiet", "--output", str(path)]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: values are not finite from frame 3")
+    assert second == "error: no space left"
