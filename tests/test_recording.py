@@ -172,6 +172,15 @@ def test_values_that_are_not_finite(steps: float, frame: int, words: str) -> Non
     assert kept.positions[-1, 0, 0, 2] < -1e-3  # strand 0 falls
 
 
+def test_under_jit_nothing_is_checked() -> None:
+    """All frames are there, the bad ones too."""
+    bad = Fails(4.5 * 9.8 * DT)
+    movie = jax.jit(lambda scene: jh.simulate(scene, fps=FPS))(scene_of((bad,)))
+    np.testing.assert_array_equal(
+        np.isfinite(movie.positions).all((1, 2, 3)), [True, True, False, False]
+    )
+
+
 def test_not_finite_without_positions() -> None:
     """What is observed may be anything."""
     bad = Fails(4.5 * 9.8 * DT)
