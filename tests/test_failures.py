@@ -95,7 +95,7 @@ def test_an_effect_that_breaks_after_a_while(solver: Any) -> None:
 
 def test_an_effect_that_breaks_in_a_later_substep() -> None:
     """In the second of four substeps: it is blamed and not the solver, and at its own point."""
-    solver = jh.Direct(substeps=4)
+    solver = jh.PositionBased(substeps=4)
     text, kept = failure(scene(BreaksLater(8.2 * DT), solver=solver))
     assert "from frame 4 on" in text
     assert "phase 'wild', strand 1, point 2): BreaksLater gives" in text
@@ -125,7 +125,7 @@ CUT = jh.Cut(hydrogen=0.0, ionic=0.0, disulfide=0.0, peptide=0.0)
 
 def test_a_pose_under_bonds_that_break_in_the_same_step() -> None:
     """It is judged by what it was given: the state after the cut. It knows no substeps."""
-    text, _ = failure(scene(PoseOfBonds(), CUT, solver=jh.PositionBased(substeps=3)))
+    text, _ = failure(scene(PoseOfBonds(), CUT, solver=jh.PositionBased(substeps=4)))
     assert "strand 0, point 1): PoseOfBonds gives values" in text
 
 
