@@ -41,8 +41,6 @@ class Checkpoints:
                 f"checkpoint is {check.short(folder)}; it must be the path of a folder"
             ) from None
         self._fingerprint = fingerprint(work)
-        for left in self.folder.glob(".new-*"):
-            left.unlink(missing_ok=True)
         self.parts: list[Arrays] = []
         """Those that were there when the folder was opened, in order."""
         self._paths = sorted(self.folder.glob("part-*.npz"))
@@ -59,6 +57,9 @@ class Checkpoints:
                     "or other options); it must be another folder, or be deleted"
                 )
             self.parts.append(part)
+        # only now: in a folder of other work they may be another process's
+        for left in self.folder.glob(".new-*"):
+            left.unlink(missing_ok=True)
         self._next = int(self._paths[-1].stem.removeprefix("part-")) + 1 if self._paths else 0
 
     def add(self, arrays: Mapping[str, Any], *, alone: bool = False) -> None:

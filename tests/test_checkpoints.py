@@ -358,3 +358,14 @@ def test_killed_twice(tmp_path: Path, what: str) -> None:
 @pytest.mark.parametrize("what", ["simulation", "fit"])
 def test_killed_15_times(tmp_path: Path, what: str) -> None:
     killed_and_finished(tmp_path, what, 15, seed=2)
+
+
+def test_a_refused_folder_is_left_as_it_is(tmp_path: Path) -> None:
+    """What another process may be writing there is not removed."""
+    Checkpoints(tmp_path, {"x": 1.0}).add({"i": np.array(0)})
+    (tmp_path / ".new-0123.npz").write_bytes(b"half")
+    with pytest.raises(ValueError, match="other work"):
+        Checkpoints(tmp_path, {"x": 2.0})
+    assert (tmp_path / ".new-0123.npz").exists()
+    Checkpoints(tmp_path, {"x": 1.0})
+    assert not (tmp_path / ".new-0123.npz").exists()
