@@ -136,18 +136,19 @@ class Problem:
         """
         point = jnp.asarray(free, self.parameters.scene.dtype)
         key = np.asarray(point).tobytes()
-        if self._last[0] != key and key in self._known:
-            self._last = (key, self._known[key])
         if self._last[0] != key:
-            residuals, jacobian, states = self._evaluate(point)
-            arrays = (np.asarray(residuals, float), np.asarray(jacobian, float))
-            self._last = (key, (*arrays, jax.tree.map(np.asarray, states)))
-            if self._journal is not None:
-                parts = {f"state {name}": x for name, x in self._last[1][2].items()}
-                parts |= {"point": np.asarray(point), "residuals": arrays[0]}
-                self._journal.add({**parts, "jacobian": arrays[1]})
+            self._last = (key, self._known.get(key) or self._simulated(point))
         found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] = self._last[1]
         return found
+
+    def _simulated(self, point: Array) -> tuple[Any, Any, Any]:
+        """What `evaluate` gives, simulated, and kept if there is a journal."""
+        residuals, jacobian, states = jax.tree.map(np.asarray, self._evaluate(point))
+        residuals, jacobian = residuals.astype(float), jacobian.astype(float)
+        if self._journal is not None:
+            arrays = {"point": np.asarray(point), "residuals": residuals, "jacobian": jacobian}
+            self._journal.add(arrays | {f"state {name}": x for name, x in states.items()})
+        return residuals, jacobian, states
 
 
 def fit(

@@ -99,7 +99,6 @@ def simulate(
     """
     check.instance("scene", scene, Scene)
     check.flag("progress", progress)
-    check.number("checkpoint_seconds", checkpoint_seconds)
     check.not_negative("checkpoint_seconds", checkpoint_seconds)
     every = max(1, round(1 / (check.constant("fps", fps) * scene.dt)))
     numbers = scene.as_arrays()

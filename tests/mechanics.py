@@ -7,9 +7,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 import jaxhair as jh
-from jaxhair.simulate import phase_end, start
+from jaxhair.simulate import phase_end, prepare, start, step
 
 DATA = Path(__file__).parent / "data"
 LENGTH = 0.1
@@ -50,6 +51,16 @@ def after(
     state = start(scene) if state is None else state
     steps = scene.phases[0].steps(scene.dt)
     return phase_end(replace(scene, phases=()), scene.phases[0].effects, state, steps=steps)
+
+
+def stepped(scene: jh.Scene, state: jh.State, steps: Any) -> jh.State:
+    """The state after some steps of the first phase; one traced program for any number of them."""
+    setup = prepare(scene, scene.phases[0].effects)
+
+    def one(number: Any, state: jh.State) -> jh.State:
+        return step(setup, state, number.astype(scene.dtype) * scene.dt)
+
+    return lax.fori_loop(0, steps, one, state)
 
 
 def tip(state: jh.State) -> np.ndarray:

@@ -15,10 +15,10 @@ from hard_cases.catalogue import SOLVERS, Setting
 from hard_cases.running import direction
 from hypothesis import given
 from hypothesis import strategies as st
-from jax import lax
+from mechanics import stepped
 
 import jaxhair as jh
-from jaxhair.simulate import prepare, start, step
+from jaxhair.simulate import start
 
 STEPS, SLOPES = 60, 8
 UNIT = 1e-5  # of quaternions' norms
@@ -90,12 +90,7 @@ def outcome(scene: jh.Scene, along: Any) -> Any:
     numbers of the scene, which grows without bound where strands collide chaotically."""
 
     def end(scene: jh.Scene, steps: int) -> jh.State:
-        setup = prepare(scene, scene.phases[0].effects)
-
-        def one(number: Any, state: jh.State) -> jh.State:
-            return step(setup, state, number.astype(scene.dtype) * scene.dt)
-
-        return lax.fori_loop(0, steps, one, start(scene))
+        return stepped(scene, start(scene), steps)
 
     return end(scene, STEPS), jax.jvp(lambda scene: end(scene, SLOPES), (scene,), (along,))[1]
 

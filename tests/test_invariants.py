@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
+from mechanics import stepped
 
 from jaxhair import quaternion as quat
 from jaxhair.bonds import Bonds, Cut, Reform
@@ -47,14 +47,10 @@ def final(scene: Scene, steps: int = STEPS, velocities: object = None) -> State:
 @jax.jit
 def _final(scene: Scene, steps: jax.Array, velocities: object) -> State:
     scene = scene.as_arrays()
-    setup, state = prepare(scene, scene.phases[0].effects), start(scene)
+    state = start(scene)
     if velocities is not None:
         state = replace(state, velocities=velocities)
-
-    def one(number: jax.Array, state: State) -> State:
-        return step(setup, state, number.astype(scene.dtype) * scene.dt)
-
-    return lax.fori_loop(0, steps, one, state)
+    return stepped(scene, state, steps)
 
 
 def curly(strands: int, points: int, seed: int = 5) -> np.ndarray:

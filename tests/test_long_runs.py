@@ -1,18 +1,13 @@
 """100,000 steps, almost 5 minutes of hair at rest and in wind: nothing drifts."""
 
 import itertools
-from typing import Any
+from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hard_cases.catalogue import DTYPES, SOLVERS, Setting, blown, helix, moved, through
-from hard_cases.running import stretch
-from jax import lax
-
-import jaxhair as jh
-from jaxhair.simulate import prepare, step
+from mechanics import stepped, stretch
 
 CHUNK, CHUNKS = 20_000, 5
 UNIT = {"float64": 1e-14, "float32": 1e-6}  # of quaternions' norms
@@ -24,14 +19,7 @@ SETTLING = 0.8  # what changes otherwise must fade at least so from one chunk to
 LATER = pytest.mark.slow  # float64: the same in more digits
 
 
-@jax.jit
-def chunk(scene: jh.Scene, state: jh.State) -> jh.State:
-    setup = prepare(scene, scene.phases[0].effects)
-
-    def one(number: Any, state: jh.State) -> jh.State:
-        return step(setup, state, jnp.zeros((), scene.dtype))
-
-    return lax.fori_loop(0, CHUNK, one, state)
+chunk = jax.jit(partial(stepped, steps=CHUNK))
 
 
 @pytest.mark.parametrize("wind", [0.0, 30.0], ids=["at rest", "in wind"])
@@ -50,8 +38,7 @@ def test_nothing_drifts(solver: str, dtype: str, wind: float) -> None:
     """
     effects = blown((0.3, 0.05, 0.1), (-0.3, 0.05, -0.2), wind)
     scene = Setting(solver, dtype).scene(through(helix(radius=0.015)), *effects)
-    start = moved(scene)
-    arrays, state = scene.as_arrays(), start.state
+    arrays, state = scene.as_arrays(), moved(scene).state
     places, lengths = [], []
     for _ in range(CHUNKS):
         state = chunk(arrays, state)
@@ -60,7 +47,7 @@ def test_nothing_drifts(solver: str, dtype: str, wind: float) -> None:
         assert np.abs(state.velocities).max() < SPEED[dtype]
         assert np.all((state.fractions >= 0) & (state.fractions <= 1))
         places.append(np.asarray(state.positions, float))
-        lengths.append(stretch(start, state))
+        lengths.append(stretch(state, scene.strands))
     for values, rounding in ((places, PLACE[dtype]), (lengths, LENGTH[dtype])):
         changes = [np.abs(b - a).max() for a, b in itertools.pairwise(values)]
         for before, after in itertools.pairwise(changes):

@@ -42,6 +42,11 @@ class Setting:
     solver: str
     dtype: str
 
+    @property
+    def physical(self) -> bool:
+        """Whether the solver needs a physical fibre."""
+        return bool(SOLVERS[self.solver].compliant)
+
     def scene(
         self,
         hair: jh.Strands,
@@ -134,6 +139,11 @@ def hard(**options: Any) -> Callable[[Callable[[Setting], Any]], Callable[[Setti
         return build
 
     return add
+
+
+def swept(why: str, **bounds: Any) -> dict[str, dict[str, Any]]:
+    """The same exception for all solvers that sweep."""
+    return {solver: {**bounds, "why": why} for solver in SWEEPING}
 
 
 # What acts. Scenes alike in effects and shapes share one compiled program, so that cases differ in

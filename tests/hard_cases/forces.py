@@ -10,7 +10,6 @@ from hard_cases.catalogue import (
     LENGTH,
     SOLVERS,
     STEP,
-    SWEEPING,
     WEIGHTLESS,
     WET,
     Setting,
@@ -21,6 +20,7 @@ from hard_cases.catalogue import (
     helix,
     moved,
     straight,
+    swept,
     through,
 )
 
@@ -85,10 +85,9 @@ def wind_of_36000_metres_a_second_squared(s: Setting) -> jh.Scene:
     end_speed=1e-3,
     stretch=0.02,
     except_for={
-        solver: {"stretch": 100.0, "why": "stretch of a swept strand grows with its weight"}
-        for solver in SWEEPING
-    }
-    | {"direct": SHORTENED},
+        **swept("stretch of a swept strand grows with its weight", stretch=100.0),
+        "direct": SHORTENED,
+    },
 )
 def gravity_of_1e5(s: Setting) -> jh.Scene:
     hair, heavy = straight((1.0, 0.0, -0.2)), jh.Gravity((0.0, 0.0, -1e5))
@@ -197,7 +196,7 @@ def all_is_held(s: Setting) -> jh.Scene:
     },
 )
 def weight_of_1_gramme_at_the_tip(s: Setting) -> jh.Scene:
-    pull = () if s.solver in ("paper", "sequential") else (jh.TipForce((0.0, 0.0, -9.8e-3)),)
+    pull = (jh.TipForce((0.0, 0.0, -9.8e-3)),) if s.physical else ()
     return s.scene(through(helix()), *HANGING, *pull, solver=twice(s))
 
 
@@ -209,10 +208,7 @@ def dt_of_1e_minus_5(s: Setting) -> jh.Scene:
 @hard(
     breaks="a step as long as a film's frame",
     speed=20,
-    except_for={
-        solver: {"stretch": 2.5, "why": "stretch of a swept strand grows as dt^2"}
-        for solver in SWEEPING
-    },
+    except_for=swept("stretch of a swept strand grows as dt^2", stretch=2.5),
 )
 def dt_of_a_24th(s: Setting) -> jh.Scene:
     return s.scene(through(helix()), *HANGING, dt=1 / 24)

@@ -1,14 +1,13 @@
 """Hard cases of a strand's shape."""
 
 from dataclasses import replace
-from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 import jaxhair as jh
 from hard_cases.catalogue import (
     HANGING,
-    SWEEPING,
     WEIGHTLESS,
     Setting,
     Start,
@@ -16,8 +15,10 @@ from hard_cases.catalogue import (
     helix,
     moved,
     straight,
+    swept,
     through,
 )
+from jaxhair.quaternion import multiply
 
 KINK = "the force along a horizontal edge is 0, where the bound on its stiffness has a kink"
 
@@ -139,13 +140,7 @@ def two_points_coincide(s: Setting) -> Start:
 @hard(
     breaks="inverse masses and inertias far apart along a strand",
     speed=10,
-    except_for={
-        solver: {
-            "stretch": 1.0,
-            "why": "of the tenth of a mm: it bears what hangs from it in 5 sweeps",
-        }
-        for solver in SWEEPING
-    },
+    except_for=swept("of the tenth of a mm: it bears what hangs from it in 5 sweeps", stretch=1.0),
 )
 def edges_of_tenth_of_a_mm_beside_3_cm(s: Setting) -> jh.Scene:
     edge = np.where(np.arange(8) % 2, 1e-4, 0.03)
@@ -170,13 +165,9 @@ def three_points(s: Setting) -> jh.Scene:
 
 @hard(
     breaks="errors that pile up along a strand; short edges, stiff against bending",
-    except_for={
-        solver: {
-            "stretch": 40.0,
-            "why": "five sweeps reach five points: at 500 the strand is a rubber band",
-        }
-        for solver in SWEEPING
-    },
+    except_for=swept(
+        "five sweeps reach five points: at 500 the strand is a rubber band", stretch=40.0
+    ),
     speed=10,
 )
 def five_hundred_points(s: Setting) -> jh.Scene:
@@ -185,25 +176,15 @@ def five_hundred_points(s: Setting) -> jh.Scene:
 
 @hard(
     breaks="50 turns of twist are let loose at once",
-    except_for={
-        solver: {"stretch": 40.0, "why": "as in five_hundred_points"} for solver in SWEEPING
-    },
+    except_for=swept("as in five_hundred_points", stretch=40.0),
     speed=50,
 )
 def twist_of_50_turns(s: Setting) -> Start:
     scene = s.scene(straight(points=500), *HANGING)
     half = np.pi * 50 * np.arange(499) / 498
     spin = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)[:, :, None]
-    q = np.asarray(moved(scene).state.orientations)
-    return moved(scene, orientations=np.asarray(multiply(q, spin)))
-
-
-def multiply(a: Any, b: Any) -> Any:
-    """Hamilton product of quaternions of shape (..., 4, strands), in NumPy."""
-    aw, av, bw, bv = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    w = aw * bw - np.sum(av * bv, 1, keepdims=True)
-    v = aw * bv + bw * av + np.cross(av, bv, axis=1)
-    return np.concatenate([w, v], 1)
+    q = moved(scene).state.orientations
+    return moved(scene, orientations=multiply(q, jnp.asarray(spin, q.dtype)))
 
 
 @hard(breaks="float32 has steps of 1 um at 10 m", speed=5)

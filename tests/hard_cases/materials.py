@@ -9,7 +9,6 @@ import jaxhair as jh
 from hard_cases.catalogue import (
     HANGING,
     SOLVERS,
-    SWEEPING,
     WET,
     Setting,
     Start,
@@ -17,6 +16,7 @@ from hard_cases.catalogue import (
     helix,
     moved,
     straight,
+    swept,
     through,
     treated,
 )
@@ -82,7 +82,7 @@ def bonded_share_ratio_of_1e6(s: Setting) -> jh.Scene:
 
 def lossy(s: Setting, thickness: float, damping: float) -> jh.Scene:
     """A fibre with a flat section and damping of its own, where the solver has these."""
-    if s.solver in ("paper", "sequential"):
+    if not s.physical:
         return s.scene(COIL, *HANGING)
     fibre = jh.PhysicalFibre(radius=40e-6, minor_radius=thickness, damping_time=damping)
     return s.scene(COIL, *HANGING, physical=fibre)
@@ -113,10 +113,7 @@ def frames_of_great_inertia(s: Setting) -> jh.Scene:
 
 @hard(
     breaks="frames that turn at a touch",
-    except_for={
-        solver: {"stretch": 40.0, "why": "frames that follow without resisting hold no length"}
-        for solver in SWEEPING
-    },
+    except_for=swept("frames that follow without resisting hold no length", stretch=40.0),
 )
 def frames_of_little_inertia(s: Setting) -> jh.Scene:
     return weighted(s, 1e4, 1e-9)

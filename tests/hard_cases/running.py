@@ -52,14 +52,6 @@ def run(case: Start, steps: int) -> tuple[jh.State, Extremes]:
     return jax.tree.map(np.asarray, _run(case.scene.as_arrays(), case.state, jnp.int32(steps)))
 
 
-def stretch(case: Start, state: jh.State) -> float:
-    """Largest relative change of an edge's length."""
-    edges = np.linalg.norm(np.diff(np.asarray(state.positions, float), axis=0), axis=1)
-    lengths = np.asarray(case.scene.strands.lengths, float).T
-    there = np.broadcast_to(lengths > 0, edges.shape)
-    return float(np.abs(edges / np.where(lengths > 0, lengths, 1) - 1)[there].max())
-
-
 def _outcome(scene: jh.Scene, state: jh.State, steps: int) -> Array:
     """One smooth number made of all that the state has after some steps."""
     setup = prepare(scene, scene.phases[0].effects)
