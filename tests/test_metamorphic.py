@@ -1,6 +1,7 @@
 """Two runs that must be related: mirrored, in other units, in pieces, with smaller steps; and what
 a run must keep or lose: momentum, energy."""
 
+import itertools
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mechanics import order, stepped
 from test_invariants import (
     DT,
     EACH,
@@ -229,3 +231,35 @@ def test_kinetic_energy_never_passes_what_was_put_in(solver: str) -> None:
     for late in (500, 1000, 2000):
         assert squares(late) < early
     assert squares(4000) < 0.05 * early
+
+
+def ends_by_dt(scene: Scene, halvings: int) -> list[np.ndarray]:
+    """Positions at the end, with dt halved again and again."""
+    found = []
+    for i in range(halvings):
+        finer = as_dtype(replace(scene, dt=scene.dt / 2**i), "float64").as_arrays()
+        steps = finer.phases[0].steps(finer.dt)
+        found.append(np.asarray(jax.jit(stepped)(finer, start(finer), steps).positions))
+    return found
+
+
+def test_halving_dt_halves_the_error_of_a_motion() -> None:
+    """Of a curly strand that swings: implicit Euler is of the first order."""
+    phases = (Phase("only", 0.1, (Hold(), Gravity((0.0, 0.0, -9.8)))),)
+    hair = from_points(curly(1, 9))
+    scene = Scene(hair, PhysicalFibre(), phases=phases, solver=SOLVERS["direct"], dt=1 / 1440)
+    ends = ends_by_dt(scene, 4)
+    errors = [np.abs(a - b).max() for a, b in itertools.pairwise(ends)]
+    assert errors[0] > 1e-5
+    assert 0.85 < order(np.array(errors)) < 1.2
+
+
+@EACH
+def test_halving_dt_of_a_fall(solver: str) -> None:
+    """A curly strand falls by g t (t + dt) / 2, whatever its elasticity does."""
+    phases = (Phase("only", 0.1, (Gravity((0.0, 0.0, -9.8)),)),)
+    scene = Scene(from_points(curly(1, 9)), phases=phases, solver=SOLVERS[solver], dt=0.01)
+    before = np.asarray(start(as_dtype(scene, "float64").as_arrays()).positions)
+    for i, end in enumerate(ends_by_dt(scene, 2)):
+        fallen = np.broadcast_to([[0.0], [0.0], [-9.8 * 0.1 * (0.1 + 0.01 / 2**i) / 2]], (9, 3, 1))
+        np.testing.assert_allclose(end - before, fallen, atol=TOLERANCE)

@@ -25,9 +25,9 @@ SHAPE = 1 + 1e-4  # of remembered shapes' norms
 assert {contact, forces, geometry, materials}  # imported for the cases that they list
 
 
-def settings(solvers: tuple[str, ...], *, later: str = "") -> list[object]:
-    """All cases for each solver and precision, each of these in a process; one precision may be
-    left to the slow run."""
+def settings(solvers: tuple[str, ...], *, later: str) -> list[object]:
+    """All cases for each solver and precision, each of these in a process; one precision is left
+    to the slow run."""
     return [
         pytest.param(
             name,
@@ -44,20 +44,7 @@ def settings(solvers: tuple[str, ...], *, later: str = "") -> list[object]:
     ]
 
 
-_last_setting: list[Setting] = []
-
-
-@pytest.fixture(autouse=True)
-def _few_programs(request: pytest.FixtureRequest) -> None:
-    """Forgets compiled programs when their solver and precision are done with: a process may have
-    65,530 pieces of memory mapped, of which hundreds of programs would need more."""
-    setting = getattr(request.node, "callspec", None) and request.node.callspec.params["setting"]
-    if setting and _last_setting != [setting]:
-        jax.clear_caches()
-        _last_setting[:] = [setting]
-
-
-@pytest.mark.parametrize(("name", "setting"), settings(tuple(SOLVERS)))
+@pytest.mark.parametrize(("name", "setting"), settings(tuple(SOLVERS), later="float64"))
 def test_values(name: str, setting: Setting) -> None:
     """All finite, and within the case's bounds; quaternions unit at every step."""
     case = CASES[name].within(setting)
