@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from jaxhair import check
@@ -41,7 +42,8 @@ class HairContact(VelocityEffect):
         """dv = sum_j alpha (2r - D) / (2r) n dt over the edges j nearer than 2r (Eq. 18).
 
         D is the distance to the nearest point of the edge, clamped to its ends, and n points
-        from there; where they coincide there is no direction, and no push.
+        from there. Where they coincide, to the rounding of positions, there is no direction, and
+        no push.
         """
         x = state.positions
         strands = x.shape[-1]
@@ -68,6 +70,8 @@ class HairContact(VelocityEffect):
         place = jnp.sum((p - start) * along, axis=1, keepdims=True)
         place = jnp.clip(place / jnp.where(square == 0, 1, square), 0, 1)
         apart = p - (start + place * along)
-        apart = jnp.moveaxis(apart, 1, -2)  # component axis where the norms expect it
+        apart, p = jnp.moveaxis(apart, 1, -2), jnp.moveaxis(p, 1, -2)  # where the norms expect it
+        known = jnp.abs(apart) > 4 * np.finfo(p.dtype).eps * quat.safe_norm(p)
+        apart = jnp.where(jnp.any(known, axis=-2, keepdims=True), apart, 0)
         depth = jnp.maximum(1 - quat.safe_norm(apart) / (2 * self.radius), 0)
         return jnp.moveaxis(depth * quat.unit(apart), -2, 1)

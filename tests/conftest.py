@@ -14,7 +14,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 os.environ["IMAGEIO_FFMPEG_NO_PREVENT_SIGINT"] = "1"
 
 MAPS = Path("/proc/self/maps")  # of Linux
-MOST_MAPS = 30_000
+MOST_MAPS = 45_000
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -26,6 +26,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_runtest_teardown() -> None:
     """Forgets compiled programs when there are many: a process may have 65,530 pieces of memory
-    mapped, each program has some dozens, and one too many kills the process."""
+    mapped, each program has hundreds, and one too many kills the process."""
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()

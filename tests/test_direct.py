@@ -189,7 +189,12 @@ NUMBERS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    "solver", [jh.Direct(), jh.Direct(newton_steps=2, substeps=2), jh.Compliant(iterations=3)]
+    "solver",
+    [
+        jh.Direct(),
+        pytest.param(jh.Direct(newton_steps=2, substeps=2), marks=pytest.mark.slow),
+        jh.Compliant(iterations=3),
+    ],
 )
 def test_gradients_agree_with_central_differences_and_between_modes(solver: Any) -> None:
     start = {name: jnp.asarray(value) for name, value in NUMBERS.items()}

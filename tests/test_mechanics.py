@@ -96,7 +96,9 @@ def test_an_end_moment_rolls_a_rod_up_to_a_circle() -> None:
         assert speed(state) < 1e-7
 
 
-@pytest.mark.parametrize("ratio", ["beta_1", "beta_2_3", "beta_0_456"])
+@pytest.mark.parametrize(
+    "ratio", [pytest.param("beta_1", marks=pytest.mark.slow), "beta_2_3", "beta_0_456"]
+)
 def test_hanging_helix(ratio: str) -> None:
     """Height of a naturally circular rod of 20 turns, by lambda = w L / (B kappa^2) and C / B."""
     beta = {"beta_1": 1.0, "beta_2_3": 2 / 3, "beta_0_456": 0.456}[ratio]

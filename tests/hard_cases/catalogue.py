@@ -22,7 +22,6 @@ SOLVERS: dict[str, Any] = {
     "compliant": jh.Compliant(),
     "direct": jh.Direct(),
 }
-DTYPES = ("float64", "float32")
 DOWN = (0.0, 0.0, -1.0)
 LENGTH = 0.24  # of most strands [m], with 9 points
 STEP = 1 / 360

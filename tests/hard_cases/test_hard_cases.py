@@ -12,7 +12,7 @@ import pytest
 from mechanics import stretch
 
 from hard_cases import contact, forces, geometry, materials, running, table
-from hard_cases.catalogue import CASES, DTYPES, SOLVERS, Setting
+from hard_cases.catalogue import CASES, SOLVERS, Setting
 
 CENTRAL = {"direct": (1e-9, 1e-4)}  # step, and largest difference relative to its terms
 CENTRAL_ELSE = 1e-6, 1e-6
@@ -25,26 +25,31 @@ SHAPE = 1 + 1e-4  # of remembered shapes' norms
 assert {contact, forces, geometry, materials}  # imported for the cases that they list
 
 
-def settings(solvers: tuple[str, ...], *, later: str) -> list[object]:
-    """All cases for each solver and precision, each of these in a process; one precision is left
-    to the slow run."""
+def settings(now: tuple[str, ...], later: tuple[str, ...]) -> list[object]:
+    """All cases for each "solver-precision", each of these in a process; later ones only in the
+    slow run."""
     return [
         pytest.param(
             name,
-            Setting(solver, dtype),
-            id=f"{solver}-{dtype}-{name}",
+            Setting(*setting.split("-")),
+            id=f"{setting}-{name}",
             marks=[
-                pytest.mark.xdist_group(f"{solver}-{dtype}"),
-                *([pytest.mark.slow] if dtype == later else []),
+                pytest.mark.xdist_group(setting),
+                *([pytest.mark.slow] if setting in later else []),
             ],
         )
-        for solver in solvers
-        for dtype in DTYPES
+        for setting in (*now, *later)
         for name in CASES
     ]
 
 
-@pytest.mark.parametrize(("name", "setting"), settings(tuple(SOLVERS), later="float64"))
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    settings(
+        tuple(f"{solver}-float32" for solver in SOLVERS),
+        tuple(f"{solver}-float64" for solver in SOLVERS),
+    ),
+)
 def test_values(name: str, setting: Setting) -> None:
     """All finite, and within the case's bounds; quaternions unit at every step."""
     case = CASES[name].within(setting)
@@ -63,7 +68,11 @@ def test_values(name: str, setting: Setting) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "setting"), settings(("paper", "compliant", "direct"), later="float32")
+    ("name", "setting"),
+    settings(
+        ("direct-float64", "paper-float64"),
+        ("compliant-float64", "direct-float32", "paper-float32", "compliant-float32"),
+    ),
 )
 def test_derivatives(name: str, setting: Setting) -> None:
     """Finite in every number of scene and state; both modes agree; so do central differences
