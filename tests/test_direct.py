@@ -343,3 +343,23 @@ def test_the_papers_scenes_with_the_direct_solver(name: str) -> None:
     length = np.asarray(scene.strands.lengths)[None]
     assert np.abs(edges.sum(-1) / length.sum(-1) - 1).max() < 0.05
     assert np.abs(edges[-1] / length[0] - 1).max() < 1e-2
+
+
+def test_at_rest_the_cover_has_no_slope() -> None:
+    """Its tip is rounded: where the moment is rounding, so would be the direction of its slope."""
+    rng = np.random.default_rng(0)
+    q = jnp.asarray(rng.normal(size=(9, 4, 2)))
+    q = q / jnp.linalg.norm(q, axis=1, keepdims=True)
+    hair = jh.Strands.straight(np.zeros((2, 3)), (1.0, 0, 0), length=0.24, points=10)
+    scene = jh.Scene(hair, jh.PhysicalFibre()).as_arrays()
+    rod = prepare(scene, ()).rod
+    unit = Units.of(rod, scene.dt)
+    shape = quat.unit(quat.relative(q[:-1], q[1:]))
+    share = jnp.ones((8, 1, 2))
+
+    def cover(q: jax.Array) -> jax.Array:
+        return hessian.joints(rod, unit, q, q, (shape, share), scene.dt).cover
+
+    spring = float(hessian.joints(rod, unit, q, q, (shape, share), scene.dt).spring.max())
+    slopes = jax.jit(jax.jacfwd(cover))(q)
+    assert float(jnp.abs(slopes).max()) < 0.2 * spring

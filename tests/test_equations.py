@@ -9,7 +9,7 @@ import pytest
 
 from jaxhair import fibre, rods
 from jaxhair import quaternion as quat
-from jaxhair.fibre import Fibre
+from jaxhair.fibre import Fibre, Soften
 from jaxhair.rods import Rod
 from jaxhair.scene import Scene
 from jaxhair.simulate import prepare
@@ -256,3 +256,12 @@ def test_13_14_distance_is_along_the_strand() -> None:
     scene = Scene(hair, Fibre(0.5, 0.4, 10.0)).as_arrays()
     k = prepare(scene, ()).rod.stiffness
     close(k, [0.5 * (1 - 0.4 * s_d) for s_d in (0.3, 0.6, 0.9)])
+
+
+@pytest.mark.parametrize("factor", [-1.0, 30.0])
+def test_stiffness_stays_a_share_under_a_factor_that_is_not_known(factor: float) -> None:
+    """A traced factor is not checked, and a fit may try any."""
+    hair = Strands.straight([(0.0, 0, 0)], (1.0, 0, 0), length=0.12, points=5)
+    scene = Scene(hair, Fibre(0.5)).as_arrays()
+    k = jax.jit(lambda factor: prepare(scene, (Soften(factor),)).rod.stiffness)(factor)
+    assert np.all((k >= 0) & (k <= 1))

@@ -1,5 +1,6 @@
 """The paper's equations (15) to (19), bonds and forces, against values derived by hand."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -9,6 +10,7 @@ import pytest
 
 from jaxhair import bonds
 from jaxhair import quaternion as quat
+from jaxhair.bonds import Cut
 from jaxhair.contact import HairContact
 from jaxhair.forces import DryingWind, Wind
 from jaxhair.rods import Rod
@@ -117,6 +119,17 @@ def test_16_no_rise_and_no_bonds(dtype: str, b: float, db: float) -> None:
         assert np.isfinite(slope).all()
 
 
+def test_cuts_at_once_leave_no_less_than_0() -> None:
+    """Three that fall by 0.4 in the same step, from 0.7."""
+    rod, state = strands_at([ACROSS])
+    state = replace(state, fractions=jnp.full_like(state.fractions, 0.7))
+    cuts = [Cut(ionic=0.0, rate=0.4 / DT)] * 3
+    after, rises = bonds.changes(cuts, rod, state, DT)
+    assert not rises
+    np.testing.assert_array_equal(after[:, 1], 0.0)
+    np.testing.assert_array_equal(after[:, 2:], 0.7)
+
+
 @DTYPES
 def test_16_stress_does_not_jump(dtype: str) -> None:
     """b' (O - O_j') = b' O - (b O_j + db O) = b (O - O_j): new bonds are free of stress."""
@@ -208,6 +221,14 @@ def test_18_a_point_on_an_edge() -> None:
     crossing = jnp.asarray([UP, ((0.0, 0, 0.05), (1, 0, 0.05))])
     close(contact(crossing), (NONE, NONE))
     assert np.isfinite(jax.jit(jax.jacrev(contact))(crossing)).all()
+
+
+def test_18_an_edge_without_length() -> None:
+    """It is a point, 1 mm away from the other strand's edge and its first point."""
+    point = ((1e-3, 0, 0.0), (1e-3, 0, 0.0))
+    strands = jnp.asarray([UP, point])
+    close(contact(strands), (((-0.5, 0, 0), (0, 0, 0)), ((0.5, 0, 0), (0.5, 0, 0))))
+    assert np.isfinite(jax.jit(jax.jacrev(contact))(strands)).all()
 
 
 @partial(jax.jit, static_argnums=2)

@@ -35,10 +35,11 @@ def k_of_0(s: Setting) -> jh.Scene:
 
 @hard(
     breaks="bends must be right within a step: 1 - k is 0, and its logarithm infinite",
-    fixed=("stiffness",),
+    fixed=("stiffness", "peeling_rate"),
 )
 def k_of_1(s: Setting) -> jh.Scene:
-    return s.scene(COIL, *HANGING, k=1.0, physical=jh.PhysicalFibre(3.89e15, 0.89e15))
+    unworn = jh.Fibre(1.0, peeling_rate=0.0)
+    return s.scene(COIL, *HANGING, k=unworn, physical=jh.PhysicalFibre(3.89e15, 0.89e15))
 
 
 def worn(s: Setting, rate: float) -> jh.Scene:
