@@ -16,7 +16,7 @@ from jaxhair import quaternion as quat
 from jaxhair.block_tridiagonal import Blocks, solve, solve_again
 from jaxhair.bonds import springs
 from jaxhair.hessian import Units
-from jaxhair.simulate import prepare
+from jaxhair.simulate import prepare, start
 from jaxhair.strands import State
 from jaxhair.treatments import AT_ONCE
 
@@ -363,3 +363,34 @@ def test_at_rest_the_cover_has_no_slope() -> None:
     spring = float(hessian.joints(rod, unit, q, q, (shape, share), scene.dt).spring.max())
     slopes = jax.jit(jax.jacfwd(cover))(q)
     assert float(jnp.abs(slopes).max()) < 0.2 * spring
+
+
+def two_edges() -> tuple[Any, jax.Array, jax.Array, jax.Array]:
+    """A rod of two edges along z: rod, points, lengths and frames, in units of an edge."""
+    hair = jh.Strands.straight([(0.0, 0, 0)], (0, 0, 1.0), length=0.02, points=3)
+    scene = jh.Scene(hair, jh.PhysicalFibre()).as_arrays()
+    state = start(scene)
+    rod = prepare(scene, ()).rod
+    return rod, state.positions / 0.01, rod.lengths / 0.01, state.orientations
+
+
+def test_edges_that_shrink_fast_do_not_turn_around() -> None:
+    """Points that would pass each other along an edge leave its frame; across, they turn it."""
+    rod, p, length, q = two_edges()
+    turned = jax.jit(direct._turned)
+    back = jnp.zeros_like(p).at[1, 2].set(-3.0)
+    np.testing.assert_allclose(turned(rod, p, back, length, q), q, atol=1e-12)
+    across = turned(rod, p, jnp.zeros_like(p).at[1, 0].set(1.0), length, q)
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(quat.tangent(across)[0, :, 0], (half, 0, half), atol=1e-12)
+
+
+def test_short_edges_say_little_of_their_direction() -> None:
+    """Points a millionth of an edge apart turn frames by that much, at a slope of 2 an edge."""
+    rod, p, length, q = two_edges()
+    near = p.at[:, 0].set(jnp.asarray([0, 1e-6, 0])[:, None]).at[:, 2].set(0.0)
+    still = jnp.zeros_like(p)
+    turned = jax.jit(direct._turned)(rod, near, still, length, q)
+    assert float(jnp.abs(turned - q).max()) < 2e-6
+    slope = jax.jit(jax.jacfwd(direct._turned, argnums=1))(rod, near, still, length, q)
+    assert float(jnp.abs(slope).max()) < 2.1
