@@ -44,7 +44,8 @@ class FitEach:
     Arguments:
         values: of each parameter, by the name it was freed with; shape (strands, ...).
         errors: standard errors of the values, of the same shapes; see `fit_each`.
-        numbers: free numbers of each parameter, shape (strands, its free numbers).
+        numbers, number_errors: free numbers x of each parameter, and their standard errors, of
+            shape (strands, its free numbers).
         residual_mm: root mean square distance between simulated and wanted points [mm], shape
             (strands,), as all below.
         converged: whether a strand met the tolerance.
@@ -55,6 +56,7 @@ class FitEach:
     values: dict[str, np.ndarray]
     errors: dict[str, np.ndarray]
     numbers: dict[str, np.ndarray]
+    number_errors: dict[str, np.ndarray]
     residual_mm: np.ndarray
     converged: np.ndarray
     reasons: tuple[str | None, ...]
@@ -66,9 +68,10 @@ class FitEach:
         """True where a strand has no reason why it could not be fitted, shape (strands,)."""
         return np.array([reason is None for reason in self.reasons])
 
-    def __str__(self) -> str:
-        fitted, total = self.fitted, len(self.reasons)
-        lines = [f"{fitted.sum()} of {total} strands fitted in {self.seconds:.0f} s"]
+    def summary(self) -> list[str]:
+        """Time, quantiles of the residual, and of the numbers of those that were fitted."""
+        fitted = self.fitted
+        lines = [f"{self.seconds:.0f} s, at most {self.steps.max()} simulations a strand"]
         known = self.residual_mm[np.isfinite(self.residual_mm)]
         if known.size:
             shares = (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -76,20 +79,27 @@ class FitEach:
                 f"{q:.0%} {x:.3g}" for q, x in zip(shares, np.quantile(known, shares), strict=True)
             )
             lines.append(f"residual [mm], share of strands at or below: {found}")
-        if fitted.any():
-            size = max(len(name) for name in self.values)
-            lines.append(f"{'':{size}}  {'10 %':>9} {'median':>9} {'90 %':>9}  standard error")
-            for name, value in self.values.items():
-                if value[0].size > 4:  # a whole shape says nothing in a line
-                    continue
-                each = value[fitted].reshape(fitted.sum(), -1).T
-                errors = self.errors[name][fitted].reshape(fitted.sum(), -1).T
-                for x, error in zip(each, errors, strict=True):
-                    low, middle, high = np.quantile(x, (0.1, 0.5, 0.9))
-                    lines.append(
-                        f"{name:{size}}  {low:9.3g} {middle:9.3g} {high:9.3g}  "
-                        f"{np.median(error):.2g}"
-                    )
+        if not fitted.any():
+            return lines
+        rows: list[tuple[str, np.ndarray, np.ndarray]] = []
+        for name, value in self.values.items():
+            shown, errors = f"{name}", self.errors[name]
+            if value[0].size > 4:  # a whole shape says nothing in a line
+                shown, value, errors = f"{name}, x", self.numbers[name], self.number_errors[name]
+            for label in np.ndindex(value.shape[1:]):
+                end = f"[{','.join(map(str, label))}]" if label else ""
+                rows.append((shown + end, *(x[fitted][:, *label] for x in (value, errors))))
+        size = max((len(name) for name, _, _ in rows), default=0)
+        lines.append(f"{'':{size}}  {'10 %':>9} {'median':>9} {'90 %':>9}  standard error (median)")
+        for name, value, error in rows:
+            low, middle, high = np.quantile(value, (0.1, 0.5, 0.9))
+            lines.append(
+                f"{name:{size}}  {low:9.3g} {middle:9.3g} {high:9.3g}  {np.median(error):.2g}"
+            )
+        return lines
+
+    def __str__(self) -> str:
+        lines = [f"{self.fitted.sum()} of {len(self.reasons)} strands fitted", *self.summary()]
         left = [(i, reason) for i, reason in enumerate(self.reasons) if reason is not None]
         lines += [f"strand {i}: {reason}" for i, reason in left[:10]]
         if len(left) > 10:
@@ -160,18 +170,20 @@ def fit_each(
             reasons[i] = f"residual of {residual:.3g} mm, above {bar:.3g} mm"
     spread = np.maximum(1, found.sums.square / max(problem.residuals - start.shape[1], 1))
     normal = found.sums.curvature / spread[:, None, None] + np.eye(start.shape[1]) / prior_width**2
-    values, errors, numbers = {}, {}, {}
+    values, errors, numbers, number_errors = {}, {}, {}, {}
     begins = np.cumsum([0, *(p.size for p in parameters)])
     with np.errstate(all="ignore"):
         covariance = _inverse(normal)
         for p, first, last in zip(parameters, begins[:-1], begins[1:], strict=True):
             numbers[p.name] = found.x[:, first:last]
             own = covariance[:, first:last, first:last]
+            number_errors[p.name] = np.sqrt(np.einsum("sii->si", own))
             values[p.name], errors[p.name] = _values(p, numbers[p.name], own, scene.dtype)
     return FitEach(
         values=values,
         errors=errors,
         numbers=numbers,
+        number_errors=number_errors,
         residual_mm=found.sums.residual_mm,
         converged=found.converged,
         reasons=tuple(reasons),

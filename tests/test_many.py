@@ -169,9 +169,7 @@ def test_a_curl_out_of_reach_is_not_fitted_and_says_why() -> None:
 
 def test_the_table_names_ten_strands_and_counts_the_others() -> None:
     ones = np.ones(13)
-    found = FitEach(
-        {"a": ones}, {"a": ones}, {"a": ones[:, None]}, ones, ones > 0, ("lost",) * 13, ones, 1.0
-    )
+    found = FitEach({"a": ones}, {"a": ones}, {}, {}, ones, ones > 0, ("lost",) * 13, ones, 1.0)
     lines = str(found).splitlines()
     assert lines[0].startswith("0 of 13 strands fitted")
     assert sum(line.endswith(": lost") for line in lines) == 10

@@ -1,0 +1,138 @@
+"""Natural strands: what they must remember, and what can be fitted of them."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fitting
+import jaxhair as jh
+from fitting.many import FitEach, fit_each
+from fitting.natural import STATE, UNLOADED, Scale, Share, natural, without_weight
+
+
+def helix(diameter: float, length: float, points: int = 60) -> np.ndarray:
+    """A curl that climbs down by 0.9 rad, from a root at which it points there too."""
+    angle = np.linspace(0, 2 * length * np.cos(0.9) / diameter, points)
+    x = diameter / 2 * np.stack([np.cos(angle) - 1, np.sin(angle)], axis=1)
+    return np.concatenate([x, -np.linspace(0, length * np.sin(0.9), points)[:, None]], axis=1)
+
+
+CURLS = [helix(14e-3, 0.06), helix(20e-3, 0.05), helix(26e-3, 0.07)]
+BAD: dict[int, tuple[Any, str]] = {
+    0: (np.zeros((1, 3)), "fewer than 3"),
+    2: (np.ones((5, 3)), "no length"),
+    3: (np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, -0.1]]), "2 different points"),
+    5: (np.array([[0.0, 0, 0], [0, 0, np.nan], [0, 0, -0.1]]), "not finite"),
+    6: (np.array([[0.0, 0, 0], [0, 0, -0.1], [0.01, 0, -0.02]]), "too far apart"),
+    8: (np.zeros((4, 2)), "(4, 2)"),
+}
+
+
+def test_what_weight_bends_is_a_cantilevers_moment() -> None:
+    """Seen straight and level: m = q (L - s)^2 / 2 at the middle of a root's half edge is B / h
+    times the turn that the strand remembers."""
+    points, length = 41, 0.05
+    x = np.zeros((1, points, 3))
+    x[0, :, 0] = np.linspace(0, length, points)
+    fibre = jh.PhysicalFibre(peeling_rate=0.0)
+    shape = without_weight(jh.Strands.from_points(x), fibre)
+    turn = 2 * np.linalg.norm(shape[0], axis=-1)
+    weight = 9.8 * float(fibre.density * fibre.area)
+    bending = float(fibre.bending_stiffness[0])
+    edge = length / (points - 1)
+    left = length - edge * np.arange(1, points - 1)
+    wanted = edge * weight * left**2 / 2 / bending
+    assert turn == pytest.approx(wanted, rel=0.05, abs=0.05 * wanted[0])
+    assert turn[0] == pytest.approx(wanted[0], rel=0.03)
+    half = without_weight(jh.Strands.from_points(x), fibre, hydrogen=0.5)
+    assert half == pytest.approx(2 * shape)
+
+
+def test_strands_hang_as_they_were_seen_and_others_are_listed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("fitting.natural.STAYS", 1e-3)
+    good = iter(CURLS)
+    strands = [BAD[i][0] if i in BAD else next(good) for i in range(9)]
+    hair = natural(strands, points=17, seconds=0.1)
+    assert list(hair.used) == [1, 4, 7]  # they stay within a thousandth of their length
+    assert list(hair.stiffer) == [1, 1, 1]
+    assert set(hair.left) == set(BAD)
+    for i, (_, words) in BAD.items():
+        assert words in hair.left[i]
+    # what is remembered is curled more than what hangs
+    seen = jh.Strands.from_points(np.asarray(hair.targets[STATE].strands)).natural_shape
+    remembered = hair.scene.strands.natural_shape
+    assert float(jnp.mean(remembered**2)) > float(jnp.mean(seen**2))
+
+    ones, reasons = np.ones(3), (None, "lost", None)
+    found = FitEach({}, {}, {}, {}, ones, ones > 0, reasons, ones, 1.0)
+    table = hair.table(found)
+    assert table.startswith("2 of 9 strands fitted")
+    assert "strand 4: lost\nstrand 5: not finite" in table
+
+
+def test_strands_seen_with_and_without_weight_show_hydrogen_and_wear() -> None:
+    hair = natural(CURLS[:2], unloaded=CURLS[:2], points=17, seconds=0.3, dtype="float64")
+    influence, rates = np.array([[0.5, 0.2, 0.2, 0.1], [0.2, 0.3, 0.3, 0.2]]), np.array([3.0, 6.0])
+    truth = replace(
+        hair.scene,
+        bonds=jh.Bonds(influence),
+        fibre=jh.PhysicalFibre(radius=25e-6, peeling_rate=rates),
+    )
+    ends = jax.jit(jh.run)(truth)
+    scene = replace(hair.scene, fibre=jh.PhysicalFibre(radius=25e-6, peeling_rate=1.0))
+    targets = {name: fitting.Shape(np.asarray(ends[name].points)) for name in (UNLOADED, STATE)}
+    found = fit_each(scene, targets, hair.free, noise_mm=0.01)
+    assert found.fitted.all()
+    assert found.values["bonds.influence"][:, 0] == pytest.approx(influence[:, 0], abs=0.01)
+    assert found.values["fibre.peeling_rate"] == pytest.approx(rates, rel=0.05)
+
+
+def test_without_weight_the_seen_shape_is_the_remembered_one() -> None:
+    hair = natural(jh.Curves.from_list(CURLS), weight=False, strands=2)
+    assert list(hair.used) == [0, 2]
+    assert 17 <= hair.scene.strands.points <= 65
+    assert list(hair.free) == ["strands.natural_shape"]
+    seen = jh.Strands.from_points(jnp.asarray(hair.targets[STATE].strands, "float32"))
+    assert np.asarray(hair.scene.strands.natural_shape) == pytest.approx(seen.natural_shape)
+
+
+def test_constraints() -> None:
+    shape = np.array([[0.1, 0.0, 0.2], [0.0, 0.6, 0.0]])
+    assert Scale().value(jnp.asarray(Scale().free(shape)), shape) == pytest.approx(shape)
+    doubled = np.array([[0.2, 0.0, 0.4], [0.0, 0.8, 0.0]])
+    assert Scale().value(jnp.log(jnp.array([2.0])), shape) == pytest.approx(doubled)
+    f = np.array([0.33, 0.30, 0.20, 0.17])
+    assert Share(0).value(jnp.asarray(Share(0).free(f)), f) == pytest.approx(f)
+    half = Share(0).value(jnp.zeros(1), f)
+    assert half == pytest.approx(np.array([0.5, *(f[1:] / f[1:].sum() / 2)]))
+    for bad in ([1.0, 0.0], [-1.0, 2.0], 1.0):
+        with pytest.raises(ValueError):
+            Share(0).free(np.asarray(bad))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"curves": []}, ["no strand", "there is none"]),
+        ({"curves": [np.zeros((1, 3))]}, ["no strand", "fewer than 3"]),
+        ({"curves": [helix(1e-3, 0.3, 500)]}, ["no strand", "rad between the edges of 65"]),
+        ({"unloaded": CURLS[:1]}, ["3 strands", "1 unloaded"]),
+        ({"unloaded": CURLS, "weight": False}, ["weight", "must be True"]),
+        ({"points": 3}, ["points", "3", "at least 4"]),
+        ({"strands": 0}, ["strands", "0", "at least 1"]),
+        ({"influence": (1.0, 1.0)}, ["influence", "(4"]),
+        ({"fibre": jh.PhysicalFibre(radius=np.full(3, 4e-5))}, ["fibre.radius", "(3,)"]),
+        ({"curves": 3}, ["curves", "3", "Sequence"]),
+    ],
+)
+def test_bad_requests_are_refused(change: dict[str, Any], words: list[str]) -> None:
+    with pytest.raises(ValueError) as error:
+        natural(**{"curves": CURLS, **change})
+    for word in words:
+        assert word in str(error.value)
