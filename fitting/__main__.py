@@ -2,12 +2,14 @@
 
 import argparse
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fitting.fit import METHODS, fit
+from fitting.fit import fit
 from fitting.measured import Measured, packaged, read
+from fitting.optimisers import METHODS
 from fitting.parameters import Constraint, Positive, Simplex
 from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
@@ -117,8 +119,16 @@ def _fit(options: argparse.Namespace) -> int:
     if not options.quiet:
         print(f"Fitting: {measured.title}. The first simulation includes compilation.")
 
-    def progress(simulations: int, residual: float) -> None:
-        print(f"  simulation {simulations:3d}: residual {residual:.4f} mm", flush=True)
+    began = time.monotonic()
+
+    def progress(simulations: int, misfit: float) -> None:
+        spent = time.monotonic() - began
+        most = spent / simulations * (options.steps - simulations)
+        print(
+            f"  simulation {simulations:3d}: misfit {misfit:.4g} standard errors, {spent:.0f} s, "
+            f"at most {most:.0f} s left",
+            flush=True,
+        )
 
     result = fit(
         measured.scene,

@@ -32,7 +32,7 @@ def undetermined(
     free: Array,
     jacobian: np.ndarray,
     *,
-    noise_mm: float,
+    noise: float = 1.0,
     limit: float = 0.3,
 ) -> tuple[tuple[Direction, ...], np.ndarray]:
     """Directions in which the fitted numbers may move with little change of the shapes.
@@ -41,9 +41,9 @@ def undetermined(
     uncertain by e / S_i along V_i. A direction counts as undetermined where that exceeds `limit`.
 
     Arguments:
-        free: fitted free numbers, shape (n,). jacobian: of the residuals [mm], shape (m, n).
-        noise_mm: of each residual. limit: in free numbers; 0.3 is a factor of 1.35.
-    Returns the directions, least determined first, and the singular values [mm].
+        free: fitted free numbers, shape (n,). jacobian: of the residuals, shape (m, n).
+        noise: standard error of each residual. limit: in free numbers; 0.3 is a factor of 1.35.
+    Returns the directions, least determined first, and the singular values.
     """
     if not np.all(np.isfinite(jacobian)):
         singular = np.full(len(free), np.nan)
@@ -55,7 +55,7 @@ def undetermined(
     labels = parameters.labels()
     found = []
     for value, direction in zip(singular[::-1], vt[::-1], strict=True):
-        uncertainty = noise_mm / value if value > 0 else np.inf
+        uncertainty = noise / value if value > 0 else np.inf
         if uncertainty <= limit:
             break
         change = slopes @ direction

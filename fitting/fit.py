@@ -1,64 +1,121 @@
-"""Fitting the numbers of a scene to wanted shapes."""
+"""Fitting the numbers of a scene, or of several experiments, to what hair was seen to do."""
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jax import Array
-from scipy.optimize import least_squares
 
 from fitting.determined import Direction, undetermined
-from fitting.parameters import Constraint, Parameters
-from fitting.targets import Target
-from jaxhair import Scene, check, run
-from jaxhair.checkpoints import Checkpoints, named, unnamed
-from jaxhair.strands import strands_first, strands_last
-
-Progress = Callable[[int, float], None]
-
-METHODS = ("levenberg-marquardt", "adam", "l-bfgs")
-JOURNAL_SECONDS = 2.0
-"""Between two writes of an optimiser's state."""
+from fitting.optimisers import (
+    LOSSES,
+    METHODS,
+    Optimum,
+    Progress,
+    gradient_descent,
+    least_squares_from,
+    rms,
+)
+from fitting.parameters import Constraint, Interval, Parameters, PerStrand, Simplex, by_name
+from fitting.problem import Problem, checked
+from fitting.targets import PointTarget
+from fitting.uncertainty import Uncertainty, laplace
+from jaxhair import Scene, check
+from jaxhair.checkpoints import Checkpoints
+from jaxhair.strands import strands_first
 
 MM = 1e3
-"""Millimetres in a metre: residuals are fitted in mm."""
+"""Millimetres in a metre."""
+
+NEAR_A_BOUND = 1e-3
+"""Share of an interval, or of a simplex, at which a value counts as being at its end."""
+
+SAME = 0.1
+"""Distance in standard deviations at which two optima are one."""
+
+
+@dataclass(frozen=True)
+class Basin:
+    """A least residual that some starts of a fit led to.
+
+    Arguments:
+        values: of each parameter there. misfit: see `Fit`. starts: how many led there.
+    """
+
+    values: dict[str, np.ndarray]
+    misfit: float
+    starts: int
 
 
 @dataclass(frozen=True)
 class Fit:
     """What a fit found.
 
+    States are named by their phase, or "experiment/phase" where there are several experiments.
+
     Arguments:
         values: of each parameter, by the name it was freed with.
-        residual_mm: root mean square distance between simulated and wanted points [mm].
-        residuals_mm: the same for each state.
-        converged: whether the optimiser met its tolerance.
+        uncertainty: intervals, covariance and correlations of every number.
+        residual_mm: root mean square distance between simulated and wanted points [mm]; NaN
+            where no state wants points.
+        residuals_mm: the same for each state that does.
+        misfit: root mean square residual in standard errors. misfits: the same of each state.
+        converged: whether the optimiser met its tolerance. reason: why it ended.
+        at_bounds: numbers that ended at an end of their range.
         undetermined: combinations of numbers that the data do not determine; empty if all are.
-        singular_values: of the residuals' Jacobian in the free numbers [mm].
-        scene: with the values put in.
+        singular_values: of the residuals' Jacobian in the free numbers [standard errors].
+        basins: least residuals that different starts led to, the best first.
+        scenes: with the values put in, by experiment; a single one has the name "".
         simulated, wanted: points [m] of each state, shape (strands, points, 3); the simulated
-            ones moved onto the wanted ones where the target asks for that.
-        steps: of the optimiser. seconds: that it took, compilation included.
+            ones moved onto the wanted ones where the target asks for that. A state that wants
+            other numbers has none in `wanted`.
+        steps: simulations that it took. seconds: compilation included.
+        problem: that was solved, for `fitting.profile`.
     """
 
     values: dict[str, np.ndarray]
+    uncertainty: Uncertainty
     residual_mm: float
     residuals_mm: dict[str, float]
+    misfit: float
+    misfits: dict[str, float]
     converged: bool
+    reason: str
+    at_bounds: tuple[str, ...]
     undetermined: tuple[Direction, ...]
     singular_values: np.ndarray
-    scene: Scene
+    basins: tuple[Basin, ...]
+    scenes: dict[str, Scene]
     simulated: dict[str, np.ndarray]
     wanted: dict[str, np.ndarray]
     steps: int
     seconds: float
+    free: np.ndarray = field(repr=False)
+    problem: Problem = field(repr=False, compare=False)
     settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def scene(self) -> Scene:
+        """The only experiment's scene. Raises ValueError where there are several."""
+        if len(self.scenes) != 1:
+            raise ValueError(f"the fit has {len(self.scenes)} scenes; take one from .scenes")
+        return next(iter(self.scenes.values()))
+
+    def again(self, targets: Mapping[str, Any], *, progress: Progress | None = None) -> "Fit":
+        """The same fit, of other observations of the same states, without compiling it again.
+
+        Arguments: those of `fit`. Raises ValueError for targets of other states or kinds, and for
+        a fit by gradient descent.
+        """
+        if self.settings["method"] != METHODS[0]:
+            raise ValueError(f"method is {self.settings['method']!r}; it must be {METHODS[0]!r}")
+        scenes = self.problem.parameters.scenes
+        problem = self.problem.with_targets(checked(scenes, targets))
+        return _solved(problem, self.settings, progress)
 
     def __str__(self) -> str:
         from fitting.report import table
@@ -66,94 +123,9 @@ class Fit:
         return table(self)
 
 
-class Problem:
-    """Residuals, and their Jacobian, as functions of the free numbers."""
-
-    def __init__(
-        self, parameters: Parameters, targets: Mapping[str, Target], prior_mm: float = 0.0
-    ) -> None:
-        self.parameters = parameters
-        self.targets = dict(targets)
-        self.prior_mm = prior_mm
-        self.start = parameters.packed()
-        self._evaluate = jax.jit(self._residuals_and_jacobian)
-        self._last: tuple[bytes, Any] = (b"", None)
-        self._journal: Checkpoints | None = None
-        self._known: dict[bytes, Any] = {}
-
-    def keep_in(self, journal: Checkpoints) -> None:
-        """Keeps every evaluation, and takes those that were kept before instead of simulating."""
-        self._journal = journal
-        for part in journal.parts:
-            states = {name: part[f"state {name}"] for name in self.targets}
-            self._known[part["point"].tobytes()] = (part["residuals"], part["jacobian"], states)
-
-    def program(self) -> str:
-        """The compiled program, as text."""
-        return str(self._evaluate.lower(self.start).as_text())
-
-    @property
-    def size(self) -> int:
-        """Number of residuals that come from the data."""
-        scene = self.parameters.scene
-        return 3 * scene.strands.points * scene.strands.count * len(self.targets)
-
-    def states(self, free: Array) -> dict[str, Array]:
-        """Of each state the residuals [m], shape (points, 3, strands)."""
-        scene = self.parameters.apply(free)
-        ends = run(scene)
-        return {
-            name: target.residuals(ends[name], self.lengths)
-            for name, target in self.targets.items()
-        }
-
-    @property
-    def lengths(self) -> Array:
-        """Rest lengths [m], shape (points - 1, 1, strands or 1)."""
-        scene = self.parameters.scene
-        return strands_last(jnp.asarray(scene.strands.lengths, scene.dtype))[:, None]
-
-    def residuals(self, free: Array) -> tuple[Array, dict[str, Array]]:
-        """All residuals [mm], shape (n,), and those of each state [m].
-
-        The last ones are the prior's: what a free number's distance from its start weighs.
-        """
-        states = self.states(free)
-        prior = self.prior_mm * (free - self.start)
-        return jnp.concatenate([*(MM * r.ravel() for r in states.values()), prior]), states
-
-    def _residuals_and_jacobian(self, free: Array) -> Any:
-        """One primal run, and its derivative in all directions at once."""
-        residuals, derivative, states = jax.linearize(self.residuals, free, has_aux=True)
-        directions = jnp.eye(free.size, dtype=free.dtype)
-        return residuals, jax.vmap(derivative, out_axes=-1)(directions), states
-
-    def evaluate(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Residuals [mm], their Jacobian, shape (n, free numbers), and residuals by state [m].
-
-        One compiled program for all; the last result is kept, since optimisers ask for the
-        residuals and for the Jacobian of the same point one after the other.
-        """
-        point = jnp.asarray(free, self.parameters.scene.dtype)
-        key = np.asarray(point).tobytes()
-        if self._last[0] != key:
-            self._last = (key, self._known.get(key) or self._simulated(point))
-        found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] = self._last[1]
-        return found
-
-    def _simulated(self, point: Array) -> tuple[Any, Any, Any]:
-        """What `evaluate` gives, simulated, and kept if there is a journal."""
-        residuals, jacobian, states = jax.tree.map(np.asarray, self._evaluate(point))
-        residuals, jacobian = residuals.astype(float), jacobian.astype(float)
-        if self._journal is not None:
-            arrays = {"point": np.asarray(point), "residuals": residuals, "jacobian": jacobian}
-            self._journal.add(arrays | {f"state {name}": x for name, x in states.items()})
-        return residuals, jacobian, states
-
-
 def fit(
-    scene: Scene,
-    targets: Mapping[str, Target],
+    scene: Scene | Mapping[str, Scene],
+    targets: Mapping[str, Any],
     free: Mapping[str, Constraint],
     *,
     method: str = "levenberg-marquardt",
@@ -162,16 +134,24 @@ def fit(
     learning_rate: float = 0.05,
     noise_mm: float = 0.1,
     prior_width: float = 3.0,
+    prior: Mapping[str, tuple[Any, Any]] | None = None,
+    loss: str = "linear",
+    starts: int = 1,
+    start_width: float = 1.0,
+    seed: int = 0,
+    level: float = 0.95,
     progress: Progress | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> Fit:
-    """The numbers of a scene with which its hair takes the wanted shapes.
+    """The numbers of scenes with which hair does what was observed.
 
-    The least sum of squared distances between simulated and wanted points over all states.
+    The least sum of squared residuals over all states, each in its standard errors.
 
     Arguments:
-        scene: with the values to start from.
-        targets: from the name of a phase to the shape wanted at its end. One state of the hair
+        scene: with the values to start from; or several experiments by their names, such as the
+            same hair on different rods, which are fitted at once.
+        targets: from the name of a phase to what is wanted at its end, or, with several
+            experiments, from an experiment's name to such a mapping. One state of the hair
             rarely determines all influences: observe it in several.
         free: from a leaf's name to its constraint, see `Parameters`.
         method: "levenberg-marquardt" with forward-mode Jacobians for few parameters; "adam" or
@@ -179,12 +159,16 @@ def fit(
         steps: largest number of the optimiser's steps, each a simulation with its derivatives.
         tolerance: relative, at which a fit has converged.
         learning_rate: of Adam, in free numbers.
-        noise_mm: error of the target's points [mm], at least which is assumed where the result
-            says what the data do not determine.
+        noise_mm: standard error of points [mm] whose target gives none.
         prior_width: how far, in free numbers, a parameter may plausibly be from its start: the
             standard deviation of a Gaussian prior. It keeps what the data do not determine near
             the start, and hardly moves what they do: 3 is a factor of 20 in a positive number.
-        progress: called with the number of simulations so far and the residual [mm].
+        prior: what is known of a parameter's values: mean and standard deviation, by its name.
+        loss: "linear" for squares; "soft_l1", "huber" or "cauchy" where some data may be wrong.
+        starts: how often to fit, from the given start and from others scattered about it.
+        start_width: standard deviation of these in free numbers. seed: of their random numbers.
+        level: of the intervals.
+        progress: called with the number of simulations so far and the misfit in standard errors.
         checkpoint: a folder in which the work is kept as it goes on. The same fit goes on from
             there, however it ended, to the same result bit for bit (on the same kind of machine).
             One process at a time may use it.
@@ -193,193 +177,224 @@ def fit(
     work or damaged.
     """
     check.choice("method", method, METHODS)
+    check.choice("loss", loss, LOSSES)
     check.whole("steps", steps, least=1)
+    check.whole("starts", starts, least=1)
+    check.whole("seed", seed, least=0)
     tolerance = check.constant("tolerance", tolerance)
     noise_mm = check.constant("noise_mm", noise_mm)
     prior_width = check.constant("prior_width", prior_width)
+    start_width = check.constant("start_width", start_width)
     learning_rate = check.constant("learning_rate", learning_rate)
-    check.instance("scene", scene, Scene)
-    check.instance("targets", targets, Mapping)
-    if not targets:
-        raise ValueError("targets is empty; it must name at least one phase")
-    for name, target in targets.items():
-        scene.phase(name)
-        check.instance(f"targets[{name!r}]", target, Target)
-    problem = Problem(Parameters(scene, free), targets, noise_mm / prior_width)
+    check.fraction("level", level)
+    if method != METHODS[0] and (loss != "linear" or starts > 1):
+        raise ValueError(f"method is {method!r}; with loss or starts it must be {METHODS[0]!r}")
+    wanted = checked(by_name(scene), targets)
+    parameters = Parameters(scene, free)
+    problem = Problem(
+        parameters,
+        wanted,
+        noise=noise_mm / MM,
+        prior_width=prior_width,
+        prior=_known_before(prior, parameters),
+    )
     settings = {
         "method": method,
         "steps": steps,
         "tolerance": tolerance,
         "noise_mm": noise_mm,
         "prior_width": prior_width,
+        "prior": {name: repr(known) for name, known in problem.prior.items()},
+        "loss": loss,
+        "starts": starts,
+        "start_width": start_width,
+        "seed": seed,
+        "level": float(level),
         "free": {name: repr(constraint) for name, constraint in free.items()},
     }
     journal = None
     if checkpoint is not None:
         journal = Checkpoints(checkpoint, _work(problem, {**settings, "rate": learning_rate}))
-    begin = time.perf_counter()
-    if method == "levenberg-marquardt":
+    if method == METHODS[0]:
         if journal is not None:
             problem.keep_in(journal)
-        best, taken, converged = _levenberg_marquardt(problem, steps, tolerance, progress)
-    else:
-        best, taken, converged = _gradient_descent(
-            problem, method, steps, tolerance, learning_rate, progress, journal
-        )
-    seconds = time.perf_counter() - begin
-    return _result(problem, best, taken, converged, seconds, noise_mm, settings)
+        return _solved(problem, settings, progress)
+    begin = time.perf_counter()
+    found = gradient_descent(
+        problem,
+        method,
+        steps=steps,
+        tolerance=tolerance,
+        learning_rate=learning_rate,
+        progress=progress,
+        journal=journal,
+    )
+    return _result(problem, [found], time.perf_counter() - begin, settings)
+
+
+def _solved(problem: Problem, settings: dict[str, Any], progress: Progress | None) -> Fit:
+    """By least squares from all starts."""
+    begin = time.perf_counter()
+    found = _from_all_starts(problem, settings, progress)
+    return _result(problem, found, time.perf_counter() - begin, settings)
+
+
+def _known_before(
+    prior: Mapping[str, tuple[Any, Any]] | None, parameters: Parameters
+) -> dict[str, tuple[Any, Any]]:
+    """Checks a prior: mean and standard deviation of named parameters."""
+    names = [p.name for p in parameters.each]
+    known: dict[str, tuple[Any, Any]] = {}
+    if prior is None:
+        return known
+    check.instance("prior", prior, Mapping)
+    for name, terms in prior.items():
+        check.choice("a name of prior", name, names)
+        if not isinstance(terms, tuple | list) or len(terms) != 2:
+            wanted = "it must be a mean and a standard deviation"
+            raise ValueError(f"prior[{name!r}] is {check.short(terms)}; {wanted}")
+        mean, deviation = terms
+        check.finite(f"prior[{name!r}][0]", mean)
+        check.positive(f"prior[{name!r}][1]", deviation, many=True)
+        shape = parameters.each[names.index(name)].start.shape
+        for term in terms:
+            if check.size(f"prior[{name!r}]", term) not in ((), shape):
+                check.shape(f"prior[{name!r}]", term, shape)
+        known[name] = (np.asarray(mean, float), np.asarray(deviation, float))
+    return known
+
+
+def _from_all_starts(
+    problem: Problem, settings: dict[str, Any], progress: Progress | None
+) -> list[Optimum]:
+    """Optima from the given start and from others about it, the best first."""
+    options = {name: settings[name] for name in ("steps", "tolerance", "loss")}
+    rng = np.random.default_rng(settings["seed"])
+    first = np.asarray(problem.start, float)
+    found: list[Optimum] = []
+    taken = 0
+
+    def told(number: int, misfit: float) -> None:
+        if progress is not None:
+            progress(taken + number, misfit)
+
+    for number in range(settings["starts"]):
+        away = rng.normal(0, settings["start_width"], first.shape)
+        start = first + (away if number else 0)
+        found.append(least_squares_from(problem, start, progress=told, **options))
+        taken += found[-1].simulations
+    return sorted(found, key=lambda optimum: (not optimum.converged, optimum.cost))
 
 
 def _work(problem: Problem, settings: dict[str, Any]) -> Any:
     """All that a fit's result depends on."""
-    scene = problem.parameters.scene
-    wanted = [t.points(problem.lengths, scene.strands.count) for t in problem.targets.values()]
+    numbers = [
+        problem.wanted(name) if isinstance(target, PointTarget) else jax.tree.leaves(target)
+        for name, target in problem.states.items()
+    ]
     return {
-        "scene": scene,
-        "wanted": wanted,
-        "states": repr([(name, t.align) for name, t in problem.targets.items()]),
+        "scene": list(problem.parameters.scenes.values()),
+        "wanted": numbers,
+        "states": repr([(name, type(t).__name__) for name, t in problem.states.items()]),
         "settings": repr(settings),
         # tells apart what the numbers do not: another effect, target or constraint of the same name
         "program": problem.program(),
     }
 
 
-def _levenberg_marquardt(
-    problem: Problem, steps: int, tolerance: float, progress: Progress | None
-) -> tuple[np.ndarray, int, bool]:
-    """MINPACK's Levenberg-Marquardt, in float64 around a simulation of any precision.
-
-    A library that traces the whole optimisation compiles the simulation several times over; here
-    it is one program, called from outside (measured on four states: 20 s against 113 s).
-    """
-    taken, last = 0, b""
-
-    def residuals(free: np.ndarray) -> np.ndarray:
-        nonlocal taken, last
-        found = problem.evaluate(free)[0]
-        if free.tobytes() != last:  # SciPy asks twice for the start
-            taken, last = taken + 1, free.tobytes()
-            if progress is not None:
-                progress(taken, _rms(found[: problem.size]))
-        return np.where(np.isfinite(found), found, 1e6)
-
-    def jacobian(free: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(problem.evaluate(free)[1])
-
-    start = np.asarray(problem.parameters.packed(), float)
-    solution = least_squares(
-        residuals,
-        start,
-        jac=jacobian,
-        method="lm",
-        ftol=tolerance,
-        xtol=tolerance,
-        gtol=1e-12,
-        max_nfev=steps,
-    )
-    return solution.x, taken, bool(solution.status > 0)
-
-
-def _gradient_descent(
-    problem: Problem,
-    method: str,
-    steps: int,
-    tolerance: float,
-    learning_rate: float,
-    progress: Progress | None,
-    journal: Checkpoints | None,
-) -> tuple[np.ndarray, int, bool]:
-    """Adam or L-BFGS on the mean square, until it falls no more by the relative tolerance.
-
-    Of a journal's parts the last one counts: the optimiser as it was after a number of steps.
-    """
-
-    def loss(free: Array) -> Array:
-        return jnp.sum(problem.residuals(free)[0] ** 2) / problem.size
-
-    optimiser: optax.GradientTransformationExtraArgs
-    if method == "adam":
-        optimiser = optax.with_extra_args_support(optax.adam(learning_rate))
-    else:
-        optimiser = optax.lbfgs()
-    value_and_gradient = jax.value_and_grad(loss)
-
-    @jax.jit
-    def update(free: Array, memory: Any) -> tuple[Array, Any, Array]:
-        value, gradient = value_and_gradient(free)
-        extra = {"value": value, "grad": gradient, "value_fn": loss}
-        change, memory = optimiser.update(gradient, memory, free, **extra)
-        return optax.apply_updates(free, change), memory, value
-
-    free = problem.parameters.packed()
-    memory = optimiser.init(free)
-    best, least = free, [np.inf]  # lowest loss after each step; Adam's own goes up and down
-    if journal is not None and journal.parts:
-        newest = journal.parts[-1]
-        kept = unnamed("optimiser", newest, (free, memory, best))
-        free, memory, best = jax.tree.map(jnp.asarray, kept)
-        least = [float(x) for x in newest["least"]]
-    patience = 25 if method == "adam" else 3
-    written = time.monotonic()
-    for step in range(len(least), steps + 1):
-        new, memory, value = update(free, memory)
-        loss_now = float(value)
-        if progress is not None:
-            progress(step, float(np.sqrt(3 * loss_now)))
-        if not np.isfinite(loss_now):
-            return np.asarray(best), step, False
-        if loss_now < least[-1]:
-            best = free
-        least.append(min(loss_now, least[-1]))
-        if step > patience and least[-1] > (1 - tolerance) * least[-1 - patience]:
-            return np.asarray(best), step, True
-        free = new
-        if journal is not None and time.monotonic() - written > JOURNAL_SECONDS:
-            state = named("optimiser", (free, memory, best))
-            journal.add({**state, "least": np.array(least)}, alone=True)
-            written = time.monotonic()
-    return np.asarray(best), steps, False
-
-
-def _rms(residuals: np.ndarray) -> float:
-    """Root mean square distance of points, from all coordinates' residuals."""
-    return float(np.sqrt(3 * np.mean(residuals**2)))
-
-
 def _result(
-    problem: Problem,
-    best: np.ndarray,
-    taken: int,
-    converged: bool,
-    seconds: float,
-    noise_mm: float,
-    settings: dict[str, Any],
+    problem: Problem, found: list[Optimum], seconds: float, settings: dict[str, Any]
 ) -> Fit:
-    parameters, scene = problem.parameters, problem.parameters.scene
-    free = jnp.asarray(best, scene.dtype)
-    residuals, jacobian, states = problem.evaluate(best)
-    residual, jacobian = _rms(residuals[: problem.size]), jacobian[: problem.size]
+    parameters, best = problem.parameters, found[0]
+    free = jnp.asarray(best.free, problem.start.dtype)
+    residuals, jacobian, states = problem.evaluate(best.free)
+    misfit = rms(residuals[: problem.size])
     directions, singular = undetermined(
-        parameters, free, jacobian, noise_mm=max(noise_mm, residual / np.sqrt(3))
+        parameters, free, jacobian[: problem.size], noise=max(1.0, misfit)
     )
-    wanted, simulated = {}, {}
-    for name, target in problem.targets.items():
-        points = target.points(problem.lengths, scene.strands.count)
+    spread = laplace(
+        parameters, best.free, jacobian, data=problem.size, scatter=misfit, level=settings["level"]
+    )
+    wanted, simulated, residuals_mm = {}, {}, {}
+    squares: list[np.ndarray] = []
+    for name, state in states.items():
+        simulated[name] = np.asarray(strands_first(state["points"]))
+        points = problem.wanted(name)
+        if points is None:
+            continue
+        target = problem.states[name]
+        off = state["residuals"] * float(problem.noise if target.error is None else target.error)
         wanted[name] = np.asarray(strands_first(points))
-        if target.align:
-            wanted[name] = wanted[name] - wanted[name].mean(axis=1, keepdims=True)
-        simulated[name] = wanted[name] + np.asarray(strands_first(states[name]))
+        simulated[name] = wanted[name] + np.asarray(strands_first(off))
+        residuals_mm[name] = MM * np.sqrt(3) * rms(off)
+        squares.append(off.ravel())
+    all_mm = MM * np.sqrt(3) * rms(np.concatenate(squares)) if squares else np.nan
     return Fit(
         values={name: np.asarray(v) for name, v in parameters.values(free).items()},
-        residual_mm=residual,
-        residuals_mm={name: _rms(MM * states[name]) for name in problem.targets},
-        converged=converged and bool(np.isfinite(residual)),
+        uncertainty=spread,
+        residual_mm=float(all_mm),
+        residuals_mm={name: float(value) for name, value in residuals_mm.items()},
+        misfit=misfit,
+        misfits={name: rms(state["residuals"]) for name, state in states.items()},
+        converged=best.converged and bool(np.isfinite(misfit)),
+        reason=best.reason if np.isfinite(misfit) else "values were not finite",
+        at_bounds=_at_bounds(parameters, free),
         undetermined=directions,
         singular_values=singular,
-        scene=parameters.apply(free),
+        basins=_basins(problem, found, spread.covariance),
+        scenes=parameters.apply(free),
         simulated=simulated,
         wanted=wanted,
-        steps=taken,
+        steps=sum(optimum.simulations for optimum in found),
         seconds=seconds,
+        free=np.asarray(best.free, float),
+        problem=problem,
         settings=settings,
     )
+
+
+def _at_bounds(parameters: Parameters, free: Any) -> tuple[str, ...]:
+    """Numbers at an end of their interval, and shares of a simplex that are nearly 0 or all."""
+    values = np.asarray(parameters.flat_values(free), float)
+    low, high = np.full_like(values, -np.inf), np.full_like(values, np.inf)
+    begin = 0
+    for p in parameters.each:
+        here = slice(begin, begin + p.start.size)
+        begin += p.start.size
+        constraint: Any = p.constraint.each if isinstance(p.constraint, PerStrand) else p.constraint
+        if isinstance(constraint, Interval):
+            low[here], high[here] = constraint.low, constraint.high
+        elif isinstance(constraint, Simplex):
+            rows = p.start.reshape(-1, p.start.shape[-1])
+            low[here], high[here] = 0, np.repeat(rows.sum(axis=1), rows.shape[1])
+    margin = NEAR_A_BOUND * np.where(np.isfinite(high - low), high - low, 0)
+    at = (values < low + margin) | (values > high - margin)
+    return tuple(label for label, out in zip(parameters.labels(), at, strict=True) if out)
+
+
+def _basins(problem: Problem, found: list[Optimum], covariance: np.ndarray) -> tuple[Basin, ...]:
+    """Optima that are apart by more than the data allow, with how many starts led to each."""
+    values, vectors = np.linalg.eigh(covariance) if np.isfinite(covariance).all() else (None, None)
+    groups: list[list[Optimum]] = []
+    for optimum in found:
+        for group in groups:
+            step = optimum.free - group[0].free
+            if values is not None and vectors is not None:
+                step = (vectors.T @ step) / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+            if np.linalg.norm(step) < SAME * np.sqrt(len(step)):
+                group.append(optimum)
+                break
+        else:
+            groups.append([optimum])
+    basins = []
+    for group in groups:
+        residuals, _, _ = problem.evaluate(group[0].free)
+        at = problem.parameters.values(jnp.asarray(group[0].free, problem.start.dtype))
+        basins.append(
+            Basin(
+                {name: np.asarray(value) for name, value in at.items()},
+                rms(residuals[: problem.size]),
+                len(group),
+            )
+        )
+    return tuple(basins)

@@ -4,9 +4,10 @@ A constraint maps free numbers, in which the optimiser moves without bounds, to 
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,8 @@ class Simplex(Constraint):
         return np.log(positive[:-1] / positive[-1])
 
     def value(self, free: Array, start: np.ndarray) -> Array:
-        return jax.nn.softmax(jnp.append(free, jnp.zeros(1, free.dtype))) * float(start.sum())
+        whole = jnp.sum(jnp.asarray(start, free.dtype))
+        return jax.nn.softmax(jnp.append(free, jnp.zeros(1, free.dtype))) * whole
 
 
 @dataclass(frozen=True)
@@ -94,82 +96,215 @@ class Unbounded(Constraint):
         return free.reshape(start.shape)
 
 
+@dataclass(frozen=True)
+class PerStrand(Constraint):
+    """A value of its own for every strand, each in the same set. For leaves that may have a first
+    axis of strands: "fibre.peeling_rate", "bonds.influence", "bonds.fraction" and the like.
+
+    For more than a few strands use `fit_each`, which is faster by as many times.
+    """
+
+    each: Constraint
+
+    def __post_init__(self) -> None:
+        check.instance("each", self.each, Constraint)
+
+    def free(self, value: np.ndarray) -> np.ndarray:
+        return np.concatenate([self.each.free(one) for one in value])
+
+    def value(self, free: Array, start: np.ndarray) -> Array:
+        rows = free.reshape(len(start), -1)
+        return jnp.stack([self.each.value(*row) for row in zip(rows, start, strict=True)])
+
+
+@dataclass(frozen=True)
+class PerExperiment(Constraint):
+    """A value of its own in every experiment, each in the same set."""
+
+    each: Constraint
+
+    def __post_init__(self) -> None:
+        check.instance("each", self.each, Constraint)
+
+    def free(self, value: np.ndarray) -> np.ndarray:
+        return self.each.free(value)
+
+    def value(self, free: Array, start: np.ndarray) -> Array:
+        return self.each.value(free, start)
+
+
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     """A name for every single number of a parameter, in the order of `numpy.ravel`."""
     if shape == ():
         return [name]
-    if name == "bonds.influence" and shape == (len(BONDS),):
-        return [f"{name}[{kind}]" for kind in BONDS]
-    return [f"{name}[{','.join(map(str, place))}]" for place in np.ndindex(shape)]
+    last: tuple[Any, ...] = tuple(range(shape[-1]))
+    if name.endswith(("bonds.influence", "bonds.fraction")) and shape[-1] == len(BONDS):
+        last = BONDS
+    places = ((*place, end) for place in np.ndindex(shape[:-1]) for end in last)
+    return [f"{name}[{','.join(map(str, place))}]" for place in places]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Numbers that are fitted, and where they stand.
+
+    Arguments:
+        name: that it is shown by. constraint: on its value. start: value to start from.
+        places: experiment and leaf that the value is put into.
+    """
+
+    name: str
+    constraint: Constraint
+    start: np.ndarray
+    places: tuple[tuple[str, str], ...]
+
+    @property
+    def size(self) -> int:
+        """How many free numbers it has."""
+        return int(self.constraint.free(self.start).size)
 
 
 class Parameters:
-    """The freed numbers of a scene, packed into one vector and put back.
+    """The freed numbers of scenes, packed into one vector and put back.
 
     Arguments:
-        scene: with the values to start from.
+        scene: with the values to start from: one, or several experiments by their names.
         free: from a leaf's name (see `jaxhair.named_leaves`) to its constraint. A name with `*`
             frees all leaves that match as one shared parameter, such as
-            "phases.*.Wound.diameter"; they must start with the same value.
+            "phases.*.Wound.diameter"; they must start with the same value. In several experiments
+            the leaves of all that have them are shared, unless the constraint is `PerExperiment`;
+            "experiment/leaf" frees those of one.
 
     Raises ValueError for a name that matches nothing, leaves of one name that differ, or a start
     outside its constraint.
     """
 
-    def __init__(self, scene: Scene, free: Mapping[str, Constraint]) -> None:
-        check.instance("scene", scene, Scene)
+    def __init__(self, scene: Scene | Mapping[str, Scene], free: Mapping[str, Constraint]) -> None:
+        self.scenes = by_name(scene)
         check.instance("free", free, Mapping)
         if not free:
             raise ValueError("free is empty; it must name at least one leaf of the scene")
-        leaves = named_leaves(scene)
-        self.scene = scene
-        self.constraints = dict(free)
-        self.leaves: dict[str, list[str]] = {}
-        self.start: dict[str, np.ndarray] = {}
+        leaves = {name: named_leaves(scene) for name, scene in self.scenes.items()}
+        self.each: list[Parameter] = []
         for name, constraint in free.items():
-            shown = check.short(name)
             if not isinstance(constraint, Constraint):
                 wanted = "it must be a constraint"
-                raise ValueError(f"free[{shown}] is {check.short(constraint)}; {wanted}")
-            matches = [leaf for leaf in leaves if isinstance(name, str) and fnmatchcase(leaf, name)]
-            if name in leaves:
-                matches = [name]
-            if not matches:
-                raise ValueError(f"free names {shown}; it must be one of {check.listed(leaves)}")
-            values = [np.asarray(leaves[leaf], float) for leaf in matches]
-            if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
-                raise ValueError(f"free names {shown}, whose leaves start with different values")
-            self.leaves[name], self.start[name] = matches, values[0]
-            try:
-                constraint.free(values[0])
-            except ValueError as error:
-                raise ValueError(f"free names {shown}, whose {error}") from error
+                shown = f"free[{check.short(name)}]"
+                raise ValueError(f"{shown} is {check.short(constraint)}; {wanted}")
+            places = _places(name, leaves)
+            if isinstance(constraint, PerExperiment):
+                for experiment in dict.fromkeys(place[0] for place in places):
+                    own = [place for place in places if place[0] == experiment]
+                    shown = f"{experiment}/{name}" if experiment else name
+                    self.each.append(self._parameter(shown, constraint.each, own, leaves))
+            else:
+                self.each.append(self._parameter(name, constraint, places, leaves))
+        taken: set[tuple[str, str]] = set()
+        for parameter in self.each:
+            if twice := taken.intersection(parameter.places):
+                leaf = next(iter(twice))[1]
+                raise ValueError(f"free names {leaf!r} twice; it must be freed once")
+            taken.update(parameter.places)
+
+    def _parameter(
+        self,
+        name: str,
+        constraint: Constraint,
+        places: Sequence[tuple[str, str]],
+        leaves: Mapping[str, Mapping[str, Any]],
+    ) -> Parameter:
+        shown = check.short(name)
+        values = []
+        for experiment, leaf in places:
+            value = np.asarray(leaves[experiment][leaf], float)
+            if isinstance(constraint, PerStrand):
+                value = _for_strands(value, leaf, self.scenes[experiment].strands.count)
+            values.append(value)
+        if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
+            raise ValueError(f"free names {shown}, whose leaves start with different values")
+        try:
+            constraint.free(values[0])
+        except ValueError as error:
+            raise ValueError(f"free names {shown}, whose {error}") from error
+        return Parameter(name, constraint, values[0], tuple(places))
+
+    @property
+    def dtype(self) -> Any:
+        """Of the free numbers: that of the scenes."""
+        return np.result_type(*(scene.dtype for scene in self.scenes.values()))
 
     def packed(self) -> Array:
         """The free numbers to start from, shape (n,), in the scene's dtype."""
-        parts = [c.free(self.start[name]).ravel() for name, c in self.constraints.items()]
-        return jnp.asarray(np.concatenate(parts), self.scene.dtype)
+        parts = [p.constraint.free(p.start).ravel() for p in self.each]
+        return jnp.asarray(np.concatenate(parts), self.dtype)
 
     def values(self, free: Array) -> dict[str, Array]:
         """Each parameter's value for free numbers of shape (n,)."""
         values, begin = {}, 0
-        for name, constraint in self.constraints.items():
-            size = constraint.free(self.start[name]).size
-            values[name] = constraint.value(free[begin : begin + size], self.start[name])
-            begin += size
+        for p in self.each:
+            values[p.name] = p.constraint.value(free[begin : begin + p.size], p.start)
+            begin += p.size
         return values
 
-    def apply(self, free: Array) -> Scene:
-        """The scene with the values for free numbers of shape (n,)."""
+    def apply(self, free: Array) -> dict[str, Scene]:
+        """The scenes with the values for free numbers of shape (n,), by experiment; one scene
+        alone has the name ""."""
         values = self.values(free)
-        return replace_leaves(
-            self.scene, {leaf: values[name] for name in values for leaf in self.leaves[name]}
-        )
+        put: dict[str, dict[str, Array]] = {name: {} for name in self.scenes}
+        for p in self.each:
+            for experiment, leaf in p.places:
+                put[experiment][leaf] = values[p.name]
+        return {name: replace_leaves(scene, put[name]) for name, scene in self.scenes.items()}
 
     def labels(self) -> list[str]:
         """A name for every single number: "bonds.influence[hydrogen]", "fibre.peeling_rate"."""
-        return [label for name, value in self.start.items() for label in labels(name, value.shape)]
+        return [label for p in self.each for label in labels(p.name, p.start.shape)]
 
     def flat_values(self, free: Array) -> Array:
         """All values in one vector, in the order of `labels`."""
         return jnp.concatenate([jnp.ravel(v) for v in self.values(free).values()])
+
+
+def by_name(scene: Scene | Mapping[str, Scene]) -> dict[str, Scene]:
+    """Scenes by experiment; a single one has the name ""."""
+    if isinstance(scene, Scene):
+        return {"": scene}
+    if not isinstance(scene, Mapping) or not scene:
+        wanted = "it must be of class Scene, or several of them by their names"
+        raise ValueError(f"scene is {check.short(scene)}; {wanted}")
+    for name, one in scene.items():
+        check.text("an experiment's name in scene", name)
+        if "/" in name:
+            raise ValueError(f"an experiment's name in scene is {name!r}; it must have no '/'")
+        check.instance(f"scene[{name!r}]", one, Scene)
+    return dict(scene)
+
+
+def _places(name: Any, leaves: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Experiment and leaf of all that a name means."""
+    experiment, slash, leaf = name.partition("/") if isinstance(name, str) else ("", "", "")
+    one = bool(slash) and experiment in leaves
+    where = {experiment: leaves[experiment]} if one else leaves
+    wanted = leaf if one else name
+    exact = [(at, wanted) for at, of_scene in where.items() if wanted in of_scene]
+    matches = exact or [
+        (at, found)
+        for at, of_scene in where.items()
+        for found in of_scene
+        if isinstance(wanted, str) and fnmatchcase(found, wanted)
+    ]
+    if not matches:
+        allowed = dict.fromkeys(found for of_scene in where.values() for found in of_scene)
+        shown = check.short(name)
+        raise ValueError(f"free names {shown}; it must be one of {check.listed(allowed)}")
+    return matches
+
+
+def _for_strands(value: np.ndarray, leaf: str, strands: int) -> np.ndarray:
+    """The value of a leaf for each strand."""
+    own = {"bonds.influence": 1, "bonds.fraction": 1}.get(leaf, 0)
+    if value.ndim == own:
+        return np.broadcast_to(value, (strands, *value.shape)).copy()
+    if value.shape[0] != strands:
+        raise ValueError(f"free names {leaf!r}, whose first axis is not that of the strands")
+    return value

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitting.parameters import labels
+from fitting.curls import Curl
 from jaxhair.export import check_new
 from jaxhair.files import Curves, write_curves
 from jaxhair.output import new_file
@@ -21,15 +21,41 @@ PACKAGES = ("jaxhair", "jax", "jaxlib", "numpy", "scipy", "optax")
 
 
 def table(fit: "Fit") -> str:
-    """The values, the residuals and what is not determined, as text."""
-    lines = [f"{'parameter':<34} {'value':>12}"]
-    lines += [f"{label:<34} {number:>12.5g}" for label, number in _numbers(fit).items()]
-    lines += ["", f"{'state':<34} {'residual':>12}"]
-    for state, residual in fit.residuals_mm.items():
-        lines.append(f"{state:<34} {residual:>9.3f} mm")
-    lines.append(f"{'all':<34} {fit.residual_mm:>9.3f} mm")
+    """The values with their intervals, the misfits and what is not determined, as text."""
+    spread = fit.uncertainty
+    percent = f"{100 * spread.level:g} % interval"
+    width = max(34, *(len(label) for label in spread.labels), *(len(s) for s in fit.misfits))
+    lines = [f"{'parameter':<{width}} {'value':>12}   {percent}"]
+    for label, value, low, high in zip(
+        spread.labels, spread.values, spread.low, spread.high, strict=True
+    ):
+        end = "  at its bound" if label in fit.at_bounds else ""
+        lines.append(f"{label:<{width}} {value:>12.5g}   {low:.4g} to {high:.4g}{end}")
+    lines += ["", f"{'state':<{width}} {'residual':>12}   in standard errors"]
+    for state, misfit in fit.misfits.items():
+        distance = fit.residuals_mm.get(state)
+        shown = "" if distance is None else f"{distance:.3f} mm"
+        lines.append(f"{state:<{width}} {shown:>12}   {misfit:.3g}")
+        target = fit.problem.states[state]
+        if isinstance(target, Curl):
+            for name, (found, wanted, error) in target.compared(fit.simulated[state]).items():
+                lines.append(f"  {name}: {found:.4g}, wanted {wanted:.4g} +- {error:.2g}")
+    shown = f"{fit.residual_mm:.3f} mm" if np.isfinite(fit.residual_mm) else ""
+    lines.append(f"{'all':<{width}} {shown:>12}   {fit.misfit:.3g}")
     verb = "converged" if fit.converged else "did NOT converge"
-    lines += ["", f"{verb} after {fit.steps} simulations in {fit.seconds:.1f} s"]
+    lines += ["", f"{verb} after {fit.steps} simulations in {fit.seconds:.1f} s: {fit.reason}"]
+    if fit.misfit > 2:
+        lines.append(
+            f"The model misses the data by {fit.misfit:.3g} standard errors: it is too simple for "
+            "them, or they are less exact than said. The intervals are widened by as much."
+        )
+    if len(fit.basins) > 1:
+        lines.append("Different starts led to different ends:")
+        lines += [f"  misfit {b.misfit:.4g} from {b.starts} starts" for b in fit.basins]
+    strong = [pair for pair in spread.strongest_correlations() if abs(pair[2]) > 0.9]
+    if strong:
+        lines.append("Numbers that the data hardly tell apart (correlation):")
+        lines += [f"  {a} and {b}: {value:+.3f}" for a, b, value in strong]
     if fit.undetermined:
         lines.append("The data do not determine (change along it, by how much in free numbers):")
         for direction in fit.undetermined:
@@ -40,22 +66,25 @@ def table(fit: "Fit") -> str:
     return "\n".join(lines)
 
 
-def _numbers(fit: "Fit") -> dict[str, float]:
-    """Every fitted number by its label."""
-    return {
-        label: float(number)
-        for name, value in fit.values.items()
-        for label, number in zip(labels(name, value.shape), value.ravel(), strict=True)
-    }
-
-
 def as_json(fit: "Fit", **more: Any) -> dict[str, Any]:
     """The fit as plain data, see `write`."""
+    spread = fit.uncertainty
+    numbers = zip(spread.labels, spread.values, spread.low, spread.high, strict=True)
     return {
-        "parameters": {label: {"value": _plain(v)} for label, v in _numbers(fit).items()},
+        "parameters": {
+            label: {"value": _plain(value), "interval": _plain([low, high])}
+            for label, value, low, high in numbers
+        },
+        "level": spread.level,
+        "correlations": _plain(spread.correlations),
         "residual_mm": _plain(fit.residual_mm),
         "residual_mm_by_state": {name: _plain(v) for name, v in fit.residuals_mm.items()},
+        "misfit": _plain(fit.misfit),
+        "misfit_by_state": {name: _plain(v) for name, v in fit.misfits.items()},
         "converged": fit.converged,
+        "reason": fit.reason,
+        "at_bounds": list(fit.at_bounds),
+        "basins": [{"misfit": _plain(b.misfit), "starts": b.starts} for b in fit.basins],
         "undetermined": [
             {"change": d.change, "uncertainty": _plain(d.uncertainty)} for d in fit.undetermined
         ],
@@ -105,16 +134,22 @@ def write(fit: "Fit", folder: Path, *, overwrite: bool = False, **more: Any) -> 
 
         pictures.comparison(
             picture,
-            list(fit.wanted.values()),
+            [fit.wanted.get(state, points) for state, points in fit.simulated.items()],
             list(fit.simulated.values()),
-            labels=list(fit.wanted),
-            residuals=[f"residual {r:.2f} mm" for r in fit.residuals_mm.values()],
+            labels=list(fit.simulated),
+            residuals=[_residual(fit, state) for state in fit.simulated],
             overwrite=overwrite,
         )
         paths.append(picture)
     except ImportError as error:
         print(f"no picture: {error}")
     return paths
+
+
+def _residual(fit: "Fit", state: str) -> str:
+    if state in fit.residuals_mm:
+        return f"residual {fit.residuals_mm[state]:.2f} mm"
+    return f"misfit {fit.misfits[state]:.2g} standard errors"
 
 
 def outputs(folder: Path, states: Iterable[str]) -> list[Path]:

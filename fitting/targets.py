@@ -14,7 +14,25 @@ from jaxhair.strands import strands_last
 
 
 class Target:
-    """The wanted shape of a scene's strands at the end of a phase."""
+    """What is wanted of a scene's strands at the end of a phase.
+
+    error: standard error of every residual, in the residuals' unit; None where they are points
+        whose error is that of the whole fit.
+    """
+
+    error: Any
+
+    @abstractmethod
+    def residuals(self, state: State, lengths: Array) -> Array:
+        """Simulated numbers less wanted ones, of any shape.
+
+        Arguments:
+            lengths: rest lengths of the scene's edges [m], shape (points - 1, 1, strands or 1).
+        """
+
+
+class PointTarget(Target):
+    """The wanted points of a scene's strands."""
 
     align: bool
 
@@ -40,13 +58,14 @@ class Target:
 
 
 @pytree
-class Helix(Target):
+class Helix(PointTarget):
     """A regular curl, the same for all strands, in any position.
 
     Arguments:
         diameter: [m]. pitch: rise in a turn [m], 0 or more.
         length: of hair [m]; where the scene's strands are longer the curl goes on.
         handedness: "right" or "left".
+        error: standard error of a point's coordinates [m]; None is the fit's.
     """
 
     diameter: Any
@@ -54,6 +73,7 @@ class Helix(Target):
     length: Any = None
     handedness: str = static(default="right")
     align: bool = static(default=True)
+    error: Any = None
 
     def __post_init__(self) -> None:
         check.positive("helix.diameter", self.diameter)
@@ -62,6 +82,8 @@ class Helix(Target):
             check.positive("helix.length", self.length)
         check.choice("helix.handedness", self.handedness, ("right", "left"))
         check.flag("helix.align", self.align)
+        if self.error is not None:
+            check.positive("helix.error", self.error)
 
     def points(self, lengths: Array, strands: int) -> Array:
         """Points on the helix, apart by the rest lengths measured straight, as a strand's are.
@@ -86,21 +108,25 @@ def helix(**options: Any) -> Helix:
 
 
 @pytree
-class Shape(Target):
+class Shape(PointTarget):
     """Given strands.
 
     Arguments:
         strands: points [m], shape (strands, points, 3), as many as in the scene; see `resampled`.
         align: compare shapes only, moving each strand rigidly to where it fits best.
+        error: standard error of a point's coordinates [m]; None is the fit's.
     """
 
     strands: Any
     align: bool = static(default=False)
+    error: Any = None
 
     def __post_init__(self) -> None:
         check.shape("target.strands", self.strands, ("strands", "points", 3))
         check.finite("target.strands", self.strands)
         check.flag("target.align", self.align)
+        if self.error is not None:
+            check.positive("target.error", self.error)
 
     def points(self, lengths: Array, strands: int) -> Array:
         """The given points."""

@@ -162,8 +162,12 @@ CASES: dict[str, Case] = {
     "fit": (
         fitting.fit,
         {"scene": SCENE, "targets": TARGETS, "free": FREE, "method": "adam", "steps": 1,
-         "tolerance": 0.1, "learning_rate": 0.1, "noise_mm": 0.1, "prior_width": 1.0},
+         "tolerance": 0.1, "learning_rate": 0.1, "noise_mm": 0.1, "prior_width": 1.0,
+         "prior": {"fibre.stiffness": (0.1, 0.1)}, "start_width": 1.0, "seed": 0, "level": 0.9},
     ),
+    "Curl": (fitting.Curl, {"diameter": (0.02, 0.001), "waves": (3.0, 0.1)}),
+    "Curvatures": (fitting.Curvatures, {"strands": np.asarray(HAIR.positions), "error": 1.0}),
+    "PerStrand": (fitting.PerStrand, {"each": fitting.Positive()}),
     "resampled": (
         fitting.resampled, {"points": CURVES.points, "counts": CURVES.counts, "size": 5}
     ),
@@ -215,7 +219,7 @@ def _in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     jh.write_curves("there.hair", CURVES)
 
-    def reached(*_: Any) -> None:
+    def reached(*_: Any, **__: Any) -> None:
         raise Reached
 
     monkeypatch.setattr(sys.modules["fitting.fit"], "Problem", reached)

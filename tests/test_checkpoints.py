@@ -215,7 +215,7 @@ def tiny_fit(
     ["levenberg-marquardt", "adam", pytest.param("l-bfgs", marks=pytest.mark.slow)],
 )
 def test_a_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
-    monkeypatch.setattr(sys.modules["fitting.fit"], "JOURNAL_SECONDS", 0.0)
+    monkeypatch.setattr(sys.modules["fitting.optimisers"], "JOURNAL_SECONDS", 0.0)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # for optax
         stopped_and_finished(tmp_path, method)
 

@@ -77,7 +77,7 @@ def test_parameters_pack_label_and_apply() -> None:
         "phases.*.Wound.diameter",
         "fibre.peeling_rate",
     ]
-    changed = parameters.apply(free.at[3].add(0.5))
+    changed = parameters.apply(free.at[3].add(0.5))[""]
     leaves = jh.named_leaves(changed)
     assert leaves["phases.perm, wound.Wound.diameter"] == leaves["phases.perm, set.Wound.diameter"]
     assert 20e-3 < float(leaves["phases.perm, set.Wound.diameter"]) < 3e-2
@@ -108,7 +108,7 @@ def free_pair() -> tuple[fitting.Parameters, jax.Array]:
     ids=["all seen", "one unseen", "only the sum seen", "fewer data than numbers"],
 )
 def test_undetermined_directions(jacobian: list, directions: list[dict[str, float]]) -> None:
-    found, singular = undetermined(*free_pair(), np.array(jacobian), noise_mm=0.01)
+    found, singular = undetermined(*free_pair(), np.array(jacobian), noise=0.01)
     assert len(singular) == 2
     assert len(found) == len(directions)
     for direction, wanted in zip(found, directions, strict=True):
@@ -122,13 +122,13 @@ def test_undetermined_directions(jacobian: list, directions: list[dict[str, floa
 
 def test_noise_decides_what_is_determined() -> None:
     jacobian = np.diag([1.0, 0.1])
-    assert undetermined(*free_pair(), jacobian, noise_mm=0.02)[0] == ()
-    found, _ = undetermined(*free_pair(), jacobian, noise_mm=0.05)
+    assert undetermined(*free_pair(), jacobian, noise=0.02)[0] == ()
+    found, _ = undetermined(*free_pair(), jacobian, noise=0.05)
     assert [d.change for d in found] == [{"fibre.peeling_rate": 1.0}]
     assert found[0].uncertainty == pytest.approx(0.5)
 
 
 def test_a_jacobian_that_is_not_finite_determines_nothing() -> None:
-    found, _ = undetermined(*free_pair(), np.array([[np.nan, 1.0]]), noise_mm=0.1)
+    found, _ = undetermined(*free_pair(), np.array([[np.nan, 1.0]]), noise=0.1)
     assert found[0].uncertainty == np.inf
     assert set(found[0].change) == {"fibre.stiffness", "fibre.peeling_rate"}
