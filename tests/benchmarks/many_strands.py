@@ -15,6 +15,7 @@ import numpy as np
 
 import fitting
 import jaxhair as jh
+from fitting import tiles
 from fitting.many import FitEach, fit_each
 
 NOISE = 1e-4  # m
@@ -74,13 +75,11 @@ def recovered(found: FitEach, truth: dict[str, np.ndarray]) -> None:
 
 def timed_tiles(scene: jh.Scene, targets: Any) -> None:
     """Prints the time of an evaluation of all strands for some sizes of tiles."""
-    from fitting.many import _freed, _numbers, _Problem
-
-    parameters = _freed(scene, FREE)
-    start = np.concatenate([_numbers(p) for p in parameters], axis=1)
+    parameters = tiles.freed(scene, FREE)
+    start = np.concatenate([tiles.numbers(p) for p in parameters], axis=1)
     everyone = np.arange(len(start))
     for tile in (8, 16, 32, 64, 128, 256):
-        problem = _Problem(scene, targets, parameters, 0.1, tile)
+        problem = tiles.Tiles(scene, targets, parameters, 0.1, tile)
         begin = time.perf_counter()
         problem.evaluate(start[:tile], everyone[:tile])
         compiled = time.perf_counter()
