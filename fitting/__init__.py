@@ -1,9 +1,12 @@
 """Inverse design of hair: which numbers of a scene give a wanted curl."""
 
 from fitting.curls import Curl, Curvatures
+from fitting.design import Design, Unreachable, Wish, design
 from fitting.determined import Direction
 from fitting.fit import Basin, Fit, fit
+from fitting.many import FitEach, fit_each
 from fitting.measured import Measured, packaged, read
+from fitting.natural import Natural, natural
 from fitting.parameters import (
     Constraint,
     Interval,
@@ -14,6 +17,7 @@ from fitting.parameters import (
     Simplex,
     Unbounded,
 )
+from fitting.profile import Profile, profile
 from fitting.strands import from_strands
 from fitting.targets import Helix, PointTarget, Shape, Target, helix, resampled
 from fitting.uncertainty import Uncertainty
@@ -23,25 +27,35 @@ __all__ = [
     "Constraint",
     "Curl",
     "Curvatures",
+    "Design",
     "Direction",
     "Fit",
+    "FitEach",
     "Helix",
     "Interval",
     "Measured",
+    "Natural",
     "Parameters",
     "PerExperiment",
     "PerStrand",
     "PointTarget",
     "Positive",
+    "Profile",
     "Shape",
     "Simplex",
     "Target",
     "Unbounded",
     "Uncertainty",
+    "Unreachable",
+    "Wish",
+    "design",
     "fit",
+    "fit_each",
     "from_strands",
     "helix",
+    "natural",
     "packaged",
+    "profile",
     "read",
     "resampled",
 ]

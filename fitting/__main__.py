@@ -4,6 +4,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ from jaxhair.__main__ import UNITS, length, parsed
 
 FREE: dict[str, Constraint] = {"bonds.influence": Simplex(), "fibre.peeling_rate": Positive()}
 
+COMMANDS = {"design": "fitting.design_command", "published": "fitting.published"}
+"""Commands besides the fit, each a module with a `main`."""
+
 
 def parser() -> argparse.ArgumentParser:
     """The command line's parser."""
@@ -25,7 +29,8 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m fitting",
         description="Finds the bond influences f_j and the cuticle's peeling rate s with which "
         "hair takes the wanted curls. Without --target it fits curls measured on real hair that "
-        "come with the package.",
+        "come with the package. Other commands: python -m fitting design --help; python -m fitting "
+        "published --help.",
         epilog="example: python -m fitting --target permed=a.hair washed=b.hair --output fitted",
     )
     top.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
@@ -56,9 +61,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the fit; returns 0, or 1 if it did not converge, or 2 after a mistake in the request,
-    or 130 after Ctrl-C."""
-    options = parsed(parser(), arguments)
+    """Runs a command, or the fit where none is named; returns 0, or 1 if it did not converge, or 2
+    after a mistake in the request, or 130 after Ctrl-C."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in COMMANDS:
+        return import_module(COMMANDS[given[0]]).main(given[1:])
+    options = parsed(parser(), given)
     try:
         return _fit(options)
     except KeyboardInterrupt:

@@ -218,7 +218,9 @@ class Parameters:
         for experiment, leaf in places:
             value = np.asarray(leaves[experiment][leaf], float)
             if isinstance(constraint, PerStrand):
-                value = _for_strands(value, leaf, self.scenes[experiment].strands.count)
+                scene = self.scenes[experiment]
+                value = _for_strands(value, leaf, scene.strands.count)
+                self.scenes[experiment] = _with_leaf(scene, leaf, value)
             values.append(value)
         if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
             raise ValueError(f"free names {shown}, whose leaves start with different values")
@@ -300,8 +302,21 @@ def _places(name: Any, leaves: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
     return matches
 
 
+def _with_leaf(scene: Scene, name: str, value: np.ndarray) -> Scene:
+    """The scene with a leaf of another shape."""
+    names = list(named_leaves(scene))
+    leaves, structure = jax.tree.flatten(scene)
+    leaves[names.index(name)] = jnp.asarray(value, scene.dtype)
+    changed: Scene = jax.tree.unflatten(structure, leaves)
+    return changed
+
+
 def _for_strands(value: np.ndarray, leaf: str, strands: int) -> np.ndarray:
     """The value of a leaf for each strand."""
+    if not leaf.startswith(("fibre.", "bonds.")):
+        raise ValueError(
+            f"free names {leaf!r} for every strand; it must be a number of the fibre or the bonds"
+        )
     own = {"bonds.influence": 1, "bonds.fraction": 1}.get(leaf, 0)
     if value.ndim == own:
         return np.broadcast_to(value, (strands, *value.shape)).copy()

@@ -71,7 +71,8 @@ class HairContact(VelocityEffect):
         place = jnp.clip(place / jnp.where(square == 0, 1, square), 0, 1)
         apart = p - (start + place * along)
         apart, p = jnp.moveaxis(apart, 1, -2), jnp.moveaxis(p, 1, -2)  # where the norms expect it
-        known = jnp.abs(apart) > 4 * np.finfo(p.dtype).eps * quat.safe_norm(p)
-        apart = jnp.where(jnp.any(known, axis=-2, keepdims=True), apart, 0)
+        rounding = 4 * np.finfo(p.dtype).eps * jnp.max(jnp.abs(p), axis=-2, keepdims=True)
+        nowhere = jnp.all(jnp.abs(apart) <= rounding, axis=-2, keepdims=True)  # NaN is not
+        apart = jnp.where(nowhere, 0, apart)
         depth = jnp.maximum(1 - quat.safe_norm(apart) / (2 * self.radius), 0)
         return jnp.moveaxis(depth * quat.unit(apart), -2, 1)

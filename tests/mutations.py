@@ -256,7 +256,7 @@ MUTATIONS = (
     Mutation(
         "jaxhair/contact.py",
         "no direction between hairs as near as rounding",
-        "jnp.where(jnp.any(known, axis=-2, keepdims=True), apart, 0)",
+        "jnp.where(nowhere, 0, apart)",
         "apart",
         hard("hairs_that_coincide", solver="direct"),
     ),

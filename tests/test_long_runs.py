@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from hard_cases.catalogue import DTYPES, SOLVERS, Setting, blown, helix, moved, through
+from hard_cases.catalogue import SOLVERS, Setting, blown, helix, moved, through
 from mechanics import stepped, stretch
 
 CHUNK, CHUNKS = 20_000, 5
@@ -28,7 +28,7 @@ chunk = jax.jit(partial(stepped, steps=CHUNK))
     [
         pytest.param(s, d, marks=[LATER] if d == "float64" or s == "sequential" else [])
         for s in SOLVERS
-        for d in DTYPES
+        for d in UNIT
     ],
 )
 def test_nothing_drifts(solver: str, dtype: str, wind: float) -> None:
