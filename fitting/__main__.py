@@ -123,7 +123,7 @@ def _fit(options: argparse.Namespace) -> int:
         )
     measured = _measured(options)
     folder.mkdir(parents=True, exist_ok=True)
-    check_outputs(folder, measured.targets, overwrite=options.overwrite)
+    check_outputs(folder, measured.states, overwrite=options.overwrite)
     if not options.quiet:
         print(f"Fitting: {measured.title}. The first simulation includes compilation.")
 

@@ -317,6 +317,7 @@ def _result(
     )
     wanted, simulated, residuals_mm = {}, {}, {}
     squares: list[np.ndarray] = []
+    states = {name: states[name] for name in problem.states}  # in the order that they were given in
     for name, state in states.items():
         simulated[name] = np.asarray(strands_first(state["points"]))
         points = problem.wanted(name)

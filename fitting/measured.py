@@ -1,4 +1,9 @@
-"""Measured curls from a text file (TOML): the scene that they were made in, and the targets."""
+"""Measured curls from a text file (TOML): the scenes that they were made in, and the targets.
+
+A file has a table [hair] and one or more [[state]]; or several experiments on the same hair, each
+an [[experiment]] with a name, what differs of [hair], `weight = true` where it hangs, and its own
+[[experiment.state]].
+"""
 
 import math
 import tomllib
@@ -11,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.curls import MEASURES, Curl
 from fitting.targets import Helix, Target
 from jaxhair import Bonds, Drag, Hold, Phase, Scene, Strands, check, treatments
 from jaxhair.arrays import contents, reason
@@ -28,8 +34,12 @@ TREATMENTS: dict[Any, Callable[..., tuple[Phase, ...]]] = {
     "acid set": treatments.acid_set,
     "perm": treatments.perm,
 }
-FILE_KEYS = {"title", "hair", "state"}
+HANGING: dict[str, Any] = {"seconds": 1.0, "free": treatments.HANGING}
+
+FILE_KEYS = {"title", "hair", "state", "experiment"}
 HAIR_KEYS = {"natural_curl_diameter", "rod_diameter", "length", "points"}
+EXPERIMENT_KEYS = {"name", "weight", "state"} | HAIR_KEYS
+CURL_KEYS = {f"curl_{name}" for name in MEASURES}
 STATE_KEYS = {
     "name",
     "treatment",
@@ -39,16 +49,28 @@ STATE_KEYS = {
     "conditions",
     "source",
     "after_wash",
+    *CURL_KEYS,
+    *(f"{key}_error" for key in CURL_KEYS),
 }
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A scene that repeats an experiment, and the curls that were measured in it."""
+    """Scenes that repeat experiments, and what was measured in them: arguments of `fitting.fit`.
+
+    A single scene and its targets by state; or several by the experiment's name.
+    """
 
     title: str
-    scene: Scene
-    targets: dict[str, Target]
+    scene: Scene | dict[str, Scene]
+    targets: dict[str, Any]
+
+    @property
+    def states(self) -> list[str]:
+        """Names of the states, as in `Fit`."""
+        if isinstance(self.scene, Scene):
+            return list(self.targets)
+        return [f"{name}/{state}" for name, states in self.targets.items() for state in states]
 
 
 def packaged() -> Measured:
@@ -81,37 +103,83 @@ def from_text(text: str, *, name: str) -> Measured:
 
 def _measured(table: dict[str, Any], name: str) -> Measured:
     hair = table.get("hair")
-    states = table.get("state")
-    if not isinstance(hair, dict) or not isinstance(states, list) or not states:
-        raise ValueError("content: it must have a table [hair] and one or more [[state]]")
+    states, experiments = table.get("state"), table.get("experiment")
+    listed = states if experiments is None else experiments
+    whole = isinstance(hair, dict) and isinstance(listed, list) and listed
+    if not whole or (states is not None and experiments is not None):
+        raise ValueError(
+            "content: it must have a table [hair] and one or more [[state]] or [[experiment]]"
+        )
+    assert isinstance(hair, dict)
+    assert isinstance(listed, list)
     _check_keys(table, FILE_KEYS, "content")
     _check_keys(hair, HAIR_KEYS, "hair")
     title = table.get("title", name)
     check.instance("title", title, str)
-    rod = _number(hair, "rod_diameter", "hair")
-    length = _number(hair, "length", "hair")
+    if experiments is None:
+        return Measured(title, *_experiment(hair, listed, "", weight=False))
+    scenes: dict[str, Scene] = {}
+    targets: dict[str, dict[str, Target]] = {}
+    for number, experiment in enumerate(listed):
+        where = f"experiment {number + 1}"
+        if not isinstance(experiment, dict):
+            raise ValueError(f"{where}: it is {check.short(experiment)}; it must be a table")
+        _check_keys(experiment, EXPERIMENT_KEYS, where)
+        label, weight = experiment.get("name", ""), experiment.get("weight", False)
+        check.text(f"{where}: name", label)
+        check.flag(f"{where}: weight", weight)
+        if "/" in label or label in scenes:
+            wanted = "it must have no '/', and differ from others"
+            raise ValueError(f"{where}: name is {label!r}; {wanted}")
+        own = experiment.get("state")
+        if not isinstance(own, list) or not own:
+            raise ValueError(f"{where}: it must have one or more [[experiment.state]]")
+        changed = {**hair, **{key: experiment[key] for key in HAIR_KEYS if key in experiment}}
+        scenes[label], targets[label] = _experiment(changed, own, f"{where}, ", weight=weight)
+    return Measured(title, scenes, targets)
+
+
+def _experiment(
+    hair: dict[str, Any], states: list[Any], where: str, *, weight: bool
+) -> tuple[Scene, dict[str, Target]]:
+    """The scene of an experiment, all states one after the other, and its targets."""
+    rod = _number(hair, "rod_diameter", f"{where}hair")
+    length = _number(hair, "length", f"{where}hair")
     points = hair.get("points", 25)
-    check.whole("hair: points", points, least=3, most=1000)
+    check.whole(f"{where}hair: points", points, least=3, most=1000)
     natural = 0.0  # as all curls here, by the inverse of its diameter [1/m]
     if "natural_curl_diameter" in hair:
-        natural = 1 / _number(hair, "natural_curl_diameter", "hair")
+        natural = 1 / _number(hair, "natural_curl_diameter", f"{where}hair")
+    rest = HANGING if weight else BRIEF
     phases: list[Phase] = []
     targets: dict[str, Target] = {}
     for number, state in enumerate(states):
-        where = f"state {number + 1}"
-        label, made = _phases(state, rod, where)
+        at = f"{where}state {number + 1}"
+        label, made = _phases(state, rod, rest, at)
         if label in targets:
-            raise ValueError(f"{where}: name is {label!r} again; names must differ")
-        phases += treatments.wash(name=f"{label}, wash before", **BRIEF) if number else ()
+            raise ValueError(f"{at}: name is {label!r} again; names must differ")
+        phases += treatments.wash(name=f"{label}, wash before", **rest) if number else ()
         phases += made
-        diameter = 1 / _inverse_diameter(state, 1 / rod, natural, where)
-        targets[label] = Helix(diameter, math.pi * diameter * math.tan(CLIMB))
+        targets[label] = _target(state, rod, natural, at)
     equal = Bonds((0.25, 0.25, 0.25, 0.25))
     try:
-        scene = Scene(curly(length, points, natural), bonds=equal, phases=tuple(phases))
+        return Scene(curly(length, points, natural), bonds=equal, phases=tuple(phases)), targets
     except ValueError as error:
-        raise ValueError(f"hair: {error}") from error
-    return Measured(title, scene, targets)
+        raise ValueError(f"{where}hair: {error}") from error
+
+
+def _target(state: dict[str, Any], rod: float, natural: float, where: str) -> Target:
+    """What was measured: numbers of the curl with their errors, or its set."""
+    given = sorted(CURL_KEYS & state.keys())
+    if not given:
+        diameter = 1 / _inverse_diameter(state, 1 / rod, natural, where)
+        return Helix(diameter, math.pi * diameter * math.tan(CLIMB))
+    numbers = {}
+    for key in given:
+        value = _number(state, key, where)
+        error = _number(state, f"{key}_error", where)
+        numbers[key.removeprefix("curl_")] = (value, error)
+    return Curl(**numbers)
 
 
 def curly(length: float, points: int, inverse_diameter: float) -> Strands:
@@ -126,7 +194,7 @@ def curly(length: float, points: int, inverse_diameter: float) -> Strands:
     return replace(hair, natural_shape=jnp.broadcast_to(shape, hair.natural_shape.shape))
 
 
-def _phases(state: Any, rod: float, where: str) -> tuple[str, list[Phase]]:
+def _phases(state: Any, rod: float, rest: dict[str, Any], where: str) -> tuple[str, list[Phase]]:
     """The state's name and the phases that lead to it, on the hair as it is then."""
     if not isinstance(state, dict):
         raise ValueError(f"{where}: it is {check.short(state)}; it must be a table")
@@ -138,9 +206,9 @@ def _phases(state: Any, rod: float, where: str) -> tuple[str, list[Phase]]:
     make = TREATMENTS[treatment]
     check.flag(f"{where}: after_wash", washed)
     label = f"{name}, before" if washed else name
-    phases = list(make(name=label, rod_diameter=rod, climb=CLIMB, **BRIEF))
+    phases = list(make(name=label, rod_diameter=rod, climb=CLIMB, **rest))
     if washed:
-        phases += treatments.wash(name=name, **BRIEF)
+        phases += treatments.wash(name=name, **rest)
     return name, phases
 
 

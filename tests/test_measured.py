@@ -161,3 +161,56 @@ def test_straight_strands_make_a_scene() -> None:
     line = np.linspace([0.0, 0, 0], [0, 0, -0.1], 20)
     measured = fitting.from_strands({"washed": jh.Curves.from_list([line])})
     assert measured.scene.strands.points >= 9
+
+
+EXPERIMENTS = """
+title = "the same hair on two rods"
+[hair]
+rod_diameter = 15e-3
+length = 0.1
+points = 15
+
+[[experiment]]
+name = "thin"
+[[experiment.state]]
+name = "water set"
+treatment = "water set"
+curl_diameter = 33.333e-3
+curl_diameter_error = 0.1e-3
+
+[[experiment]]
+name = "thick"
+rod_diameter = 20e-3
+length = 0.12
+[[experiment.state]]
+name = "water set"
+treatment = "water set"
+curl_diameter = 44.444e-3
+curl_diameter_error = 0.1e-3
+"""
+
+
+def test_experiments_from_a_file() -> None:
+    """Both have a set of 0.45, on rods and hair of their own."""
+    found = from_text(EXPERIMENTS, name="two.toml")
+    assert found.states == ["thin/water set", "thick/water set"]
+    assert isinstance(found.scene, dict)
+    result = fitting.fit(found.scene, found.targets, {"bonds.influence": fitting.Simplex()})
+    assert float(result.values["bonds.influence"][0]) == pytest.approx(0.45, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "thick"', 'name = "thin"', "experiment 2: name is 'thin'"),
+        ('name = "thick"', 'name = "a/b"', "no '/'"),
+        ("curl_diameter_error = 0.1e-3", "", "curl_diameter_error"),
+        ('name = "thin"', 'name = "thin"\nweight = 1', "weight"),
+        ('name = "thin"', 'name = "thin"\ncolour = 1', "'colour' is unknown"),
+        ("[[experiment.state]]", "[[experiment.other]]", "'other' is unknown"),
+        ("[[experiment]]\n", '[[state]]\nname="a"\n[[experiment]]\n', "content"),
+    ],
+)
+def test_wrong_experiments_are_refused(old: str, new: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        from_text(EXPERIMENTS.replace(old, new), name="two.toml")

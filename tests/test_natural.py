@@ -76,6 +76,7 @@ def test_strands_hang_as_they_were_seen_and_others_are_listed(
     assert "strand 4: lost\nstrand 5: not finite" in table
 
 
+@pytest.mark.slow
 def test_strands_seen_with_and_without_weight_show_hydrogen_and_wear() -> None:
     hair = natural(CURLS[:2], unloaded=CURLS[:2], points=17, seconds=0.3, dtype="float64")
     influence, rates = np.array([[0.5, 0.2, 0.2, 0.1], [0.2, 0.3, 0.3, 0.2]]), np.array([3.0, 6.0])
