@@ -51,6 +51,9 @@ EXACT = 1e-3
 EDGES_PER_CURL = 8.0
 """Curl diameters are so many edges, 25 points a turn."""
 
+LEAST_EDGES = 48
+"""Of the hair, where curls are so wide that few edges would do for them."""
+
 HAIR_ERRORS = {"bonds.influence": 0.1, "fibre.young_modulus": 0.1, "fibre.shear_modulus": 0.1}
 """Relative standard errors of what is not well known of a hair, and in which answers are told."""
 
@@ -118,15 +121,23 @@ class Wish:
     def scene(self, *, finer: bool = False) -> Scene:
         """The treatment of one strand; `finer`: with twice the points, a third of the time step,
         and uncoiling from the rod in place of taking the shape free of stress at once."""
-        edge = self.curl_diameter / EDGES_PER_CURL / (2 if finer else 1)
+        edge = min(self.curl_diameter / EDGES_PER_CURL, self.length / LEAST_EDGES)
+        edge = edge / 2 if finer else edge
         points = int(np.clip(math.ceil(self.length / edge) + 1, 9, 258 if finer else 129))
         hair = Strands.straight(
             np.zeros((1, 3)), (0.0, 0.0, -1.0), length=self.length, points=points
         )
-        free: tuple[Any, ...] = (Hold(), Drag(0.05))
+        fibre = PhysicalFibre()
+        # the slowest swing, of a straight hair held at one end, is damped as fast as can be
+        swing = float(
+            self.length**2
+            * np.sqrt(fibre.density * fibre.area / fibre.bending_stiffness[0])
+            / 3.516
+        )
+        free: tuple[Any, ...] = (Hold(), Drag(swing / 2))
         if self.weight:
-            free = (Hold(), Gravity(), Drag(0.05))
-        resting = (2.0 if finer else 1.0) if self.weight or finer else treatments.AT_ONCE
+            free = (Hold(), Gravity(), Drag(swing / 2))
+        resting = 8 * swing if self.weight or finer else treatments.AT_ONCE
         options: dict[str, Any] = {"free": free, "seconds": resting, "unload": not finer}
         rod = float(np.clip(self.curl_diameter / 1.5, 1.01 * RODS[0], 0.99 * RODS[1]))
         phases = treatments.perm(
@@ -136,7 +147,7 @@ class Wish:
             phases += treatments.wash(**options)
         return Scene(
             hair,
-            PhysicalFibre(),
+            fibre,
             Bonds(self.influence),
             phases,
             Direct(newton_steps=2 if finer else 1) if self.weight or finer else PositionBased(),

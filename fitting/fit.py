@@ -34,6 +34,9 @@ MM = 1e3
 NEAR_A_BOUND = 1e-3
 """Share of an interval, or of a simplex, at which a value counts as being at its end."""
 
+GOOD = 2.0
+"""Misfit in standard errors that is taken for a fit of the right kind of model."""
+
 SAME = 0.1
 """Distance in standard deviations at which two optima are one."""
 
@@ -137,6 +140,7 @@ def fit(
     prior: Mapping[str, tuple[Any, Any]] | None = None,
     loss: str = "linear",
     starts: int = 1,
+    retries: int = 3,
     start_width: float = 1.0,
     seed: int = 0,
     level: float = 0.95,
@@ -166,6 +170,8 @@ def fit(
         prior: what is known of a parameter's values: mean and standard deviation, by its name.
         loss: "linear" for squares; "soft_l1", "huber" or "cauchy" where some data may be wrong.
         starts: how often to fit, from the given start and from others scattered about it.
+        retries: how many more starts to try, as long as the misfit is above `GOOD`: curls may fit
+            wrongly, a turn off, where the misfit is least nearby only.
         start_width: standard deviation of these in free numbers. seed: of their random numbers.
         level: of the intervals.
         progress: called with the number of simulations so far and the misfit in standard errors.
@@ -180,6 +186,7 @@ def fit(
     check.choice("loss", loss, LOSSES)
     check.whole("steps", steps, least=1)
     check.whole("starts", starts, least=1)
+    check.whole("retries", retries, least=0)
     check.whole("seed", seed, least=0)
     tolerance = check.constant("tolerance", tolerance)
     noise_mm = check.constant("noise_mm", noise_mm)
@@ -207,6 +214,7 @@ def fit(
         "prior": {name: repr(known) for name, known in problem.prior.items()},
         "loss": loss,
         "starts": starts,
+        "retries": retries,
         "start_width": start_width,
         "seed": seed,
         "level": float(level),
@@ -278,12 +286,15 @@ def _from_all_starts(
         if progress is not None:
             progress(taken + number, misfit)
 
-    for number in range(settings["starts"]):
+    for number in range(settings["starts"] + settings["retries"]):
+        good = found and np.sqrt(2 * min(o.cost for o in found) / problem.size) < GOOD
+        if number >= settings["starts"] and good:
+            break
         away = rng.normal(0, settings["start_width"], first.shape)
         start = first + (away if number else 0)
         found.append(least_squares_from(problem, start, progress=told, **options))
         taken += found[-1].simulations
-    return sorted(found, key=lambda optimum: (not optimum.converged, optimum.cost))
+    return sorted(found, key=lambda optimum: optimum.cost)
 
 
 def _work(problem: Problem, settings: dict[str, Any]) -> Any:

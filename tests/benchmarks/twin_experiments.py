@@ -133,7 +133,8 @@ def main() -> None:
     parser.add_argument("--truths", type=int, default=50)
     truths = parser.parse_args().truths
     first = twins(truths)
-    mismatched(first)
+    if truths:
+        mismatched(first)
 
 
 if __name__ == "__main__":
