@@ -1,5 +1,6 @@
 """Natural strands: what they must remember, and what can be fitted of them."""
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -55,7 +56,7 @@ def test_what_weight_bends_is_a_cantilevers_moment() -> None:
 def test_strands_hang_as_they_were_seen_and_others_are_listed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("fitting.natural.STAYS", 1e-3)
+    monkeypatch.setattr(sys.modules["fitting.natural"], "STAYS", 1e-3)
     good = iter(CURLS)
     strands = [BAD[i][0] if i in BAD else next(good) for i in range(9)]
     hair = natural(strands, points=17, seconds=0.1)

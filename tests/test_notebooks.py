@@ -46,7 +46,9 @@ def test_readme_python_runs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    run(code)
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) == 2
+    for code in blocks:
+        run(code)
     assert (tmp_path / "perm.gif").stat().st_size > 10_000
     assert "converged" in capsys.readouterr().out
