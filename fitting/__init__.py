@@ -1,23 +1,24 @@
 """Inverse design of hair: which numbers of a scene give a wanted curl."""
 
-from fitting.curls import Curl, Curvatures
-from fitting.design import Design, Unreachable, Wish, design
-from fitting.determined import Direction
-from fitting.fit import Basin, Fit, fit
-from fitting.many import FitEach, fit_each
-from fitting.measured import Measured, packaged, read
-from fitting.natural import Natural, natural
-from fitting.parameters import (
+from fitting.constraints import (
     Constraint,
     Interval,
-    Parameters,
     PerExperiment,
     PerStrand,
     Positive,
     Simplex,
     Unbounded,
 )
+from fitting.curls import Curl, Curvatures
+from fitting.design import Design, Unreachable, Wish, design
+from fitting.determined import Direction
+from fitting.fit import Fit, fit
+from fitting.many import FitEach, fit_each
+from fitting.measured import Measured, packaged, read
+from fitting.natural import Natural, natural
+from fitting.parameters import Parameters
 from fitting.profile import Profile, profile
+from fitting.starts import Basin
 from fitting.strands import from_strands
 from fitting.targets import Helix, PointTarget, Shape, Target, helix, resampled
 from fitting.uncertainty import Uncertainty

@@ -8,10 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from fitting.constraints import Constraint, Positive, Simplex
 from fitting.fit import fit
 from fitting.measured import Measured, packaged, read
 from fitting.optimisers import METHODS
-from fitting.parameters import Constraint, Positive, Simplex
 from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
 from jaxhair import read_curves

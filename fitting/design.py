@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting import measures
+from fitting.constraints import Constraint, Interval
 from fitting.curls import Curl
 from fitting.fit import Fit, fit
-from fitting.parameters import Constraint, Interval
+from fitting.parameters import matching
 from jaxhair import (
     Bonds,
     Direct,
@@ -248,20 +249,18 @@ def _off(found: Fit, wish: Wish) -> float:
     return abs(float(_curl(found, wish).diameter[0]) / wish.curl_diameter - 1)
 
 
-def _leaves(scene: Scene, name: str) -> list[str]:
-    """Leaves of a name with a `*`, of phases that have one."""
-    ending = name.removeprefix("phases.*")
-    return [leaf for leaf in named_leaves(scene) if leaf.endswith(ending)]
-
-
 def _value(found: Fit, name: str) -> float:
     """A number of the fitted scene."""
-    return float(named_leaves(found.scene)[_leaves(found.scene, name)[0]])
+    return float(named_leaves(found.scene)[matching(name, named_leaves(found.scene))[0]])
 
 
 def _with(scene: Scene, values: Mapping[str, float]) -> Scene:
     """The scene with other numbers."""
-    put = {leaf: jnp.asarray(v) for name, v in values.items() for leaf in _leaves(scene, name)}
+    put = {
+        leaf: jnp.asarray(v)
+        for name, v in values.items()
+        for leaf in matching(name, named_leaves(scene))
+    }
     return replace_leaves(scene, put)
 
 
@@ -285,8 +284,8 @@ def _sensitivities(found: Fit, wish: Wish) -> dict[str, float]:
     """d D_rod / d u times the standard error of u, so that the curl stays: by implicit derivatives,
     -(dD / du) / (dD / dD_rod)."""
     scene = found.scene
-    rods = _leaves(scene, ROD)
     leaves = named_leaves(scene)
+    rods = matching(ROD, leaves)
     errors = {name: share for name, share in HAIR_ERRORS.items() if name in leaves}
     names = ["rod"]
     changes: list[dict[str, Any]] = [dict.fromkeys(rods, np.asarray(1.0))]

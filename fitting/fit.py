@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.constraints import Constraint
 from fitting.determined import Direction, undetermined
 from fitting.optimisers import (
     LOSSES,
@@ -17,41 +18,16 @@ from fitting.optimisers import (
     Optimum,
     Progress,
     gradient_descent,
-    least_squares_from,
     rms,
 )
-from fitting.parameters import Constraint, Interval, Parameters, PerStrand, Simplex, by_name
+from fitting.parameters import Parameters, by_name
 from fitting.problem import Problem, checked
-from fitting.targets import PointTarget
+from fitting.starts import Basin, basins, from_all_starts
+from fitting.targets import MM, PointTarget
 from fitting.uncertainty import Uncertainty, laplace
 from jaxhair import Scene, check
 from jaxhair.checkpoints import Checkpoints
 from jaxhair.strands import strands_first
-
-MM = 1e3
-"""Millimetres in a metre."""
-
-NEAR_A_BOUND = 1e-3
-"""Share of an interval, or of a simplex, at which a value counts as being at its end."""
-
-GOOD = 2.0
-"""Misfit in standard errors that is taken for a fit of the right kind of model."""
-
-SAME = 0.1
-"""Distance in standard deviations at which two optima are one."""
-
-
-@dataclass(frozen=True)
-class Basin:
-    """A least residual that some starts of a fit led to.
-
-    Arguments:
-        values: of each parameter there. misfit: see `Fit`. starts: how many led there.
-    """
-
-    values: dict[str, np.ndarray]
-    misfit: float
-    starts: int
 
 
 @dataclass(frozen=True)
@@ -170,7 +146,7 @@ def fit(
         prior: what is known of a parameter's values: mean and standard deviation, by its name.
         loss: "linear" for squares; "soft_l1", "huber" or "cauchy" where some data may be wrong.
         starts: how often to fit, from the given start and from others scattered about it.
-        retries: how many more starts to try, as long as the misfit is above `GOOD`: curls may fit
+        retries: how many more starts to try, as long as the misfit is above 2: curls may fit
             wrongly, a turn off, where the misfit is least nearby only.
         start_width: standard deviation of these in free numbers. seed: of their random numbers.
         level: of the intervals.
@@ -243,7 +219,7 @@ def fit(
 def _solved(problem: Problem, settings: dict[str, Any], progress: Progress | None) -> Fit:
     """By least squares from all starts."""
     begin = time.perf_counter()
-    found = _from_all_starts(problem, settings, progress)
+    found = from_all_starts(problem, settings, progress)
     return _result(problem, found, time.perf_counter() - begin, settings)
 
 
@@ -270,31 +246,6 @@ def _known_before(
                 check.shape(f"prior[{name!r}]", term, shape)
         known[name] = (np.asarray(mean, float), np.asarray(deviation, float))
     return known
-
-
-def _from_all_starts(
-    problem: Problem, settings: dict[str, Any], progress: Progress | None
-) -> list[Optimum]:
-    """Optima from the given start and from others about it, the best first."""
-    options = {name: settings[name] for name in ("steps", "tolerance", "loss")}
-    rng = np.random.default_rng(settings["seed"])
-    first = np.asarray(problem.start, float)
-    found: list[Optimum] = []
-    taken = 0
-
-    def told(number: int, misfit: float) -> None:
-        if progress is not None:
-            progress(taken + number, misfit)
-
-    for number in range(settings["starts"] + settings["retries"]):
-        good = found and np.sqrt(2 * min(o.cost for o in found) / problem.size) < GOOD
-        if number >= settings["starts"] and good:
-            break
-        away = rng.normal(0, settings["start_width"], first.shape)
-        start = first + (away if number else 0)
-        found.append(least_squares_from(problem, start, progress=told, **options))
-        taken += found[-1].simulations
-    return sorted(found, key=lambda optimum: optimum.cost)
 
 
 def _work(problem: Problem, settings: dict[str, Any]) -> Any:
@@ -350,10 +301,10 @@ def _result(
         misfits={name: rms(state["residuals"]) for name, state in states.items()},
         converged=best.converged and bool(np.isfinite(misfit)),
         reason=best.reason if np.isfinite(misfit) else "values were not finite",
-        at_bounds=_at_bounds(parameters, free),
+        at_bounds=parameters.at_bounds(free),
         undetermined=directions,
         singular_values=singular,
-        basins=_basins(problem, found, spread.covariance),
+        basins=basins(problem, found, spread.covariance),
         scenes=parameters.apply(free),
         simulated=simulated,
         wanted=wanted,
@@ -363,50 +314,3 @@ def _result(
         problem=problem,
         settings=settings,
     )
-
-
-def _at_bounds(parameters: Parameters, free: Any) -> tuple[str, ...]:
-    """Numbers at an end of their interval, and shares of a simplex that are nearly 0 or all."""
-    values = np.asarray(parameters.flat_values(free), float)
-    low, high = np.full_like(values, -np.inf), np.full_like(values, np.inf)
-    begin = 0
-    for p in parameters.each:
-        here = slice(begin, begin + p.start.size)
-        begin += p.start.size
-        constraint: Any = p.constraint.each if isinstance(p.constraint, PerStrand) else p.constraint
-        if isinstance(constraint, Interval):
-            low[here], high[here] = constraint.low, constraint.high
-        elif isinstance(constraint, Simplex):
-            rows = p.start.reshape(-1, p.start.shape[-1])
-            low[here], high[here] = 0, np.repeat(rows.sum(axis=1), rows.shape[1])
-    margin = NEAR_A_BOUND * np.where(np.isfinite(high - low), high - low, 0)
-    at = (values < low + margin) | (values > high - margin)
-    return tuple(label for label, out in zip(parameters.labels(), at, strict=True) if out)
-
-
-def _basins(problem: Problem, found: list[Optimum], covariance: np.ndarray) -> tuple[Basin, ...]:
-    """Optima that are apart by more than the data allow, with how many starts led to each."""
-    values, vectors = np.linalg.eigh(covariance) if np.isfinite(covariance).all() else (None, None)
-    groups: list[list[Optimum]] = []
-    for optimum in found:
-        for group in groups:
-            step = optimum.free - group[0].free
-            if values is not None and vectors is not None:
-                step = (vectors.T @ step) / np.sqrt(np.maximum(values, np.finfo(float).tiny))
-            if np.linalg.norm(step) < SAME * np.sqrt(len(step)):
-                group.append(optimum)
-                break
-        else:
-            groups.append([optimum])
-    basins = []
-    for group in groups:
-        residuals, _, _ = problem.evaluate(group[0].free)
-        at = problem.parameters.values(jnp.asarray(group[0].free, problem.start.dtype))
-        basins.append(
-            Basin(
-                {name: np.asarray(value) for name, value in at.items()},
-                rms(residuals[: problem.size]),
-                len(group),
-            )
-        )
-    return tuple(basins)

@@ -7,20 +7,20 @@ with a damping for each strand.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fitting import tiles
-from fitting.parameters import Constraint
-from fitting.targets import Shape, Target
-from fitting.tiles import MM, Squares, Tiles
+from fitting.constraints import Constraint
+from fitting.optimisers import Progress
+from fitting.problem import checked
+from fitting.targets import MM, Shape, Target
+from fitting.tiles import Squares, Tiles
 from jaxhair import HairContact, Scene, check
 from jaxhair.effects import of_kind
-
-Progress = Callable[[int, float], None]
 
 TILE = 64
 """Strands simulated together: the fastest of `tests/benchmarks/many_strands.py`."""
@@ -187,12 +187,8 @@ def fit_each(
 
 
 def _checked(scene: Scene, targets: Mapping[str, Target]) -> dict[str, Target]:
-    check.instance("targets", targets, Mapping)
-    if not targets:
-        raise ValueError("targets is empty; it must name at least one phase")
-    for name, target in targets.items():
-        scene.phase(name)
-        check.instance(f"targets[{name!r}]", target, Target)
+    by_phase = checked({"": scene}, targets)[""]
+    for name, target in by_phase.items():
         if isinstance(target, Shape):
             wanted = (scene.strands.count, scene.strands.points, 3)
             check.shape(f"targets[{name!r}].strands", target.strands, wanted)
@@ -202,7 +198,7 @@ def _checked(scene: Scene, targets: Mapping[str, Target]) -> dict[str, Target]:
                 f"phase {phase.name!r} has a HairContact; strands that are fitted each by itself "
                 "must not touch"
             )
-    return dict(targets)
+    return by_phase
 
 
 def _bars(scene: Scene, bar_mm: float | None) -> np.ndarray:

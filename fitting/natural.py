@@ -28,8 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from fitting.constraints import Constraint, Positive
 from fitting.many import TILE, FitEach
-from fitting.parameters import Constraint, Positive
 from fitting.targets import Shape, Target, resampled
 from jaxhair import Bonds, Curves, Direct, PhysicalFibre, Scene, Strands, check, run, treatments
 from jaxhair import quaternion as quat
@@ -106,6 +106,9 @@ class Share(Constraint):
         share = jax.nn.sigmoid(free[0])
         rest = others * ((1 - share) * whole / jnp.sum(others))
         return rest.at[self.place].set(share * whole)
+
+    def bounds(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(start.shape), np.full(start.shape, start.sum())
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def least_squares_from(
             if progress is not None:
                 progress(taken, rms(residuals[: problem.size]))
         broken = broken or not (np.isfinite(residuals).all() and np.isfinite(jacobian).all())
-        residuals, jacobian = np.where(np.isfinite(residuals), residuals, 1e6), jacobian
+        residuals = np.where(np.isfinite(residuals), residuals, 1e6)
         if extra is not None:
             more = extra(free)
             residuals = np.concatenate([residuals, more[0]])

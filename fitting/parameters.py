@@ -1,10 +1,6 @@
-"""Which numbers of a scene a fit may change, and within what bounds.
+"""Which numbers of a scene a fit may change."""
 
-A constraint maps free numbers, in which the optimiser moves without bounds, to admissible values.
-"""
-
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -14,123 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from fitting.constraints import Constraint, PerExperiment, PerStrand
 from jaxhair import Scene, check, named_leaves, replace_leaves
 from jaxhair.strands import BONDS
 
+NEAR_A_BOUND = 1e-3
+"""Share of a range at which a value counts as being at its end."""
 
-class Constraint:
-    """A set of admissible values."""
-
-    @abstractmethod
-    def free(self, value: np.ndarray) -> np.ndarray:
-        """Free numbers of an admissible value, shape (n,). Raises ValueError for another value."""
-
-    @abstractmethod
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        """The value for free numbers, of the shape of the starting value."""
-
-
-@dataclass(frozen=True)
-class Simplex(Constraint):
-    """Numbers of at least 0 whose sum stays: x_j = log(v_j / v_last). For influences."""
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        if value.ndim != 1 or np.any(value < 0) or value.sum() <= 0:
-            raise ValueError(f"value is {check.short(value)}; it must be a list of numbers >= 0")
-        positive = np.maximum(value, 1e-6 * value.sum())
-        return np.log(positive[:-1] / positive[-1])
-
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        whole = jnp.sum(jnp.asarray(start, free.dtype))
-        return jax.nn.softmax(jnp.append(free, jnp.zeros(1, free.dtype))) * whole
-
-
-@dataclass(frozen=True)
-class Positive(Constraint):
-    """Numbers above 0: v = exp(x)."""
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        if np.any(value <= 0):
-            raise ValueError(f"value is {check.short(value)}; it must be above 0")
-        return np.log(value.ravel())
-
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        return jnp.exp(free).reshape(start.shape)
-
-
-@dataclass(frozen=True)
-class Interval(Constraint):
-    """Numbers between two bounds: v = low + (high - low) / (1 + exp(-x))."""
-
-    low: float
-    high: float
-
-    def __post_init__(self) -> None:
-        for name in ("low", "high"):
-            check.number(name, getattr(self, name))
-            object.__setattr__(self, name, float(getattr(self, name)))
-        if not self.low < self.high:
-            raise ValueError(f"high is {self.high}; it must be above low, {self.low}")
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        if np.any((value < self.low) | (value > self.high)):
-            wanted = f"it must be in [{self.low}, {self.high}]"
-            raise ValueError(f"value is {check.short(value)}; {wanted}")
-        share = np.clip((value.ravel() - self.low) / (self.high - self.low), 1e-6, 1 - 1e-6)
-        return np.log(share / (1 - share))
-
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        inside = self.low + (self.high - self.low) * jax.nn.sigmoid(free)
-        # rounding may lead past the upper bound
-        return jnp.minimum(inside, self.high).reshape(start.shape)
-
-
-@dataclass(frozen=True)
-class Unbounded(Constraint):
-    """Any numbers: v = x."""
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        return value.ravel()
-
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        return free.reshape(start.shape)
-
-
-@dataclass(frozen=True)
-class PerStrand(Constraint):
-    """A value of its own for every strand, each in the same set. For leaves that may have a first
-    axis of strands: "fibre.peeling_rate", "bonds.influence", "bonds.fraction" and the like.
-
-    For more than a few strands use `fit_each`, which is faster by as many times.
-    """
-
-    each: Constraint
-
-    def __post_init__(self) -> None:
-        check.instance("each", self.each, Constraint)
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        return np.concatenate([self.each.free(one) for one in value])
-
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        rows = free.reshape(len(start), -1)
-        return jnp.stack([self.each.value(*row) for row in zip(rows, start, strict=True)])
-
-
-@dataclass(frozen=True)
-class PerExperiment(Constraint):
-    """A value of its own in every experiment, each in the same set."""
-
-    each: Constraint
-
-    def __post_init__(self) -> None:
-        check.instance("each", self.each, Constraint)
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        return self.each.free(value)
-
-    def value(self, free: Array, start: np.ndarray) -> Array:
-        return self.each.value(free, start)
+OWN_AXES = {"bonds.influence": 1, "bonds.fraction": 1}
+"""Axes of a leaf besides that of the strands, where that is not the only one."""
 
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -181,16 +69,10 @@ class Parameters:
 
     def __init__(self, scene: Scene | Mapping[str, Scene], free: Mapping[str, Constraint]) -> None:
         self.scenes = by_name(scene)
-        check.instance("free", free, Mapping)
-        if not free:
-            raise ValueError("free is empty; it must name at least one leaf of the scene")
+        check_free(free)
         leaves = {name: named_leaves(scene) for name, scene in self.scenes.items()}
         self.each: list[Parameter] = []
         for name, constraint in free.items():
-            if not isinstance(constraint, Constraint):
-                wanted = "it must be a constraint"
-                shown = f"free[{check.short(name)}]"
-                raise ValueError(f"{shown} is {check.short(constraint)}; {wanted}")
             places = _places(name, leaves)
             if isinstance(constraint, PerExperiment):
                 for experiment in dict.fromkeys(place[0] for place in places):
@@ -222,8 +104,7 @@ class Parameters:
                 value = _for_strands(value, leaf, scene.strands.count)
                 self.scenes[experiment] = _with_leaf(scene, leaf, value)
             values.append(value)
-        if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
-            raise ValueError(f"free names {shown}, whose leaves start with different values")
+        check_alike(name, values)
         try:
             constraint.free(values[0])
         except ValueError as error:
@@ -266,6 +147,51 @@ class Parameters:
         """All values in one vector, in the order of `labels`."""
         return jnp.concatenate([jnp.ravel(v) for v in self.values(free).values()])
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ends of the numbers' ranges, in the order of `labels`; infinite where there are none."""
+        each = [p.constraint.bounds(p.start) for p in self.each]
+        low, high = (np.concatenate([np.ravel(pair[i]) for pair in each]) for i in (0, 1))
+        return low, high
+
+    def at_bounds(self, free: Array) -> tuple[str, ...]:
+        """Labels of the numbers at an end of a range that has two."""
+        values = np.asarray(self.flat_values(free), float)
+        low, high = self.bounds()
+        margin = NEAR_A_BOUND * np.where(np.isfinite(high - low), high - low, 0)
+        at = (values < low + margin) | (values > high - margin)
+        return tuple(label for label, out in zip(self.labels(), at, strict=True) if out)
+
+
+def check_free(free: Any) -> None:
+    """Raises ValueError for what is no mapping of constraints, or an empty one."""
+    check.instance("free", free, Mapping)
+    if not free:
+        raise ValueError("free is empty; it must name at least one leaf of the scene")
+    for name, constraint in free.items():
+        if not isinstance(constraint, Constraint):
+            shown = f"free[{check.short(name)}] is {check.short(constraint)}"
+            raise ValueError(f"{shown}; it must be a constraint")
+
+
+def check_alike(name: str, values: Sequence[np.ndarray]) -> None:
+    """Raises ValueError where values to start from differ."""
+    if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
+        shown = check.short(name)
+        raise ValueError(f"free names {shown}, whose leaves start with different values")
+
+
+def matching(name: Any, leaves: Iterable[str]) -> list[str]:
+    """The leaf of a name, or all that it matches with a `*`."""
+    names = list(leaves)
+    if name in names or not isinstance(name, str):
+        return [name] if name in names else []
+    return [leaf for leaf in names if fnmatchcase(leaf, name)]
+
+
+def unknown(name: Any, leaves: Iterable[str]) -> ValueError:
+    """That `free` names no leaf."""
+    return ValueError(f"free names {check.short(name)}; it must be one of {check.listed(leaves)}")
+
 
 def by_name(scene: Scene | Mapping[str, Scene]) -> dict[str, Scene]:
     """Scenes by experiment; a single one has the name ""."""
@@ -288,17 +214,9 @@ def _places(name: Any, leaves: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
     one = bool(slash) and experiment in leaves
     where = {experiment: leaves[experiment]} if one else leaves
     wanted = leaf if one else name
-    exact = [(at, wanted) for at, of_scene in where.items() if wanted in of_scene]
-    matches = exact or [
-        (at, found)
-        for at, of_scene in where.items()
-        for found in of_scene
-        if isinstance(wanted, str) and fnmatchcase(found, wanted)
-    ]
+    matches = [(at, found) for at in where for found in matching(wanted, where[at])]
     if not matches:
-        allowed = dict.fromkeys(found for of_scene in where.values() for found in of_scene)
-        shown = check.short(name)
-        raise ValueError(f"free names {shown}; it must be one of {check.listed(allowed)}")
+        raise unknown(name, dict.fromkeys(leaf for of_scene in where.values() for leaf in of_scene))
     return matches
 
 
@@ -317,8 +235,7 @@ def _for_strands(value: np.ndarray, leaf: str, strands: int) -> np.ndarray:
         raise ValueError(
             f"free names {leaf!r} for every strand; it must be a number of the fibre or the bonds"
         )
-    own = {"bonds.influence": 1, "bonds.fraction": 1}.get(leaf, 0)
-    if value.ndim == own:
+    if value.ndim == OWN_AXES.get(leaf, 0):
         return np.broadcast_to(value, (strands, *value.shape)).copy()
     if value.shape[0] != strands:
         raise ValueError(f"free names {leaf!r}, whose first axis is not that of the strands")

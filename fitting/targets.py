@@ -12,6 +12,9 @@ from jaxhair import Curves, State, check, pytree
 from jaxhair.pytree import static
 from jaxhair.strands import strands_last
 
+MM = 1e3
+"""Millimetres in a metre."""
+
 
 class Target:
     """What is wanted of a scene's strands at the end of a phase.

@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import jax
@@ -11,16 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from fitting.parameters import Constraint
-from fitting.targets import Shape, Target
+from fitting.constraints import Constraint
+from fitting.parameters import OWN_AXES, check_alike, check_free, matching, unknown
+from fitting.targets import MM, Shape, Target
 from jaxhair import Scene, check, named_leaves, run
 from jaxhair.strands import strands_last
-
-MM = 1e3
-"""Millimetres in a metre."""
-
-OWN_AXES = {"bonds.influence": 1, "bonds.fraction": 1}
-"""Axes of a leaf besides that of the strands, where that is not the only one."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +35,17 @@ class Freed:
 
 def freed(scene: Scene, free: Mapping[str, Constraint]) -> tuple[Freed, ...]:
     """What `fit_each` frees. Raises ValueError for leaves that cannot be freed so."""
-    check.instance("free", free, Mapping)
-    if not free:
-        raise ValueError("free is empty; it must name at least one leaf of the scene")
+    check_free(free)
     leaves = named_leaves(scene)
     names = list(leaves)
     found: list[Freed] = []
     for name, constraint in free.items():
         shown = check.short(name)
-        if not isinstance(constraint, Constraint):
-            wanted = "it must be a constraint"
-            raise ValueError(f"free[{shown}] is {check.short(constraint)}; {wanted}")
-        matches = [n for n in names if n == name or fnmatchcase(n, str(name))]
+        matches = matching(name, names)
         if not matches:
-            raise ValueError(f"free names {shown}; it must be one of {check.listed(names)}")
+            raise unknown(name, names)
         starts = [_start(scene, n, leaves[n]) for n in matches]
-        if any(s.shape != starts[0].shape or np.any(s != starts[0]) for s in starts):
-            raise ValueError(f"free names {shown}, whose leaves start with different values")
+        check_alike(name, starts)
         places = tuple(names.index(n) for n in matches)
         if any(set(places) & set(p.leaves) for p in found):
             raise ValueError(f"free names {shown}, of which a leaf is named twice")

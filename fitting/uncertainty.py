@@ -1,14 +1,13 @@
 """How sure a fit is: covariance, intervals, correlations (Laplace's approximation)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
-from fitting.parameters import Interval, Parameters, PerStrand, Positive, Simplex
+from fitting.parameters import Parameters
 
 
 @dataclass(frozen=True)
@@ -101,35 +100,22 @@ def _inverse(precision: np.ndarray) -> np.ndarray:
     return (vectors / np.maximum(values, floor)) @ vectors.T
 
 
-def _range(constraint: Interval | Simplex, start: np.ndarray) -> tuple[float, Any]:
-    """Lower end, and width of the range; a simplex of each strand has a sum of its own."""
-    if isinstance(constraint, Interval):
-        return constraint.low, constraint.high - constraint.low
-    rows = start.reshape(-1, start.shape[-1])
-    return 0.0, np.repeat(rows.sum(axis=1), rows.shape[1])
-
-
 def _ends(
     parameters: Parameters, values: np.ndarray, deviation: np.ndarray, times: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values less and plus so many standard deviations, each within its constraint."""
-    low, high = np.empty_like(values), np.empty_like(values)
-    begin = 0
-    for p in parameters.each:
-        here = slice(begin, begin + p.start.size)
-        begin += p.start.size
-        constraint: Any = p.constraint.each if isinstance(p.constraint, PerStrand) else p.constraint
-        v, d = values[here], times * deviation[here]
-        if isinstance(constraint, Positive):
-            factor = np.exp(np.minimum(d / np.maximum(v, np.finfo(float).tiny), 700))
-            low[here], high[here] = v / factor, v * factor
-        elif isinstance(constraint, Interval | Simplex):
-            bottom, width = _range(constraint, p.start)
-            share = np.clip((v - bottom) / width, 1e-12, 1 - 1e-12)
-            logit = np.log(share / (1 - share))
-            step = d / width / (share * (1 - share))
-            low[here] = bottom + width / (1 + np.exp(np.clip(step - logit, -700, 700)))
-            high[here] = bottom + width / (1 + np.exp(np.clip(-step - logit, -700, 700)))
-        else:
-            low[here], high[here] = v - d, v + d
+    """Values less and plus so many standard deviations, each within its range."""
+    bottom, top = parameters.bounds()
+    step = times * deviation
+    low, high = values - step, values + step
+    half = np.isfinite(bottom) & ~np.isfinite(top)
+    above = np.maximum(values[half] - bottom[half], np.finfo(float).tiny)
+    factor = np.exp(np.minimum(step[half] / above, 700))
+    low[half], high[half] = bottom[half] + above / factor, bottom[half] + above * factor
+    both = np.isfinite(bottom) & np.isfinite(top)
+    width = (top - bottom)[both]
+    share = np.clip((values - bottom)[both] / width, 1e-12, 1 - 1e-12)
+    logit, moved = np.log(share / (1 - share)), step[both] / width / (share * (1 - share))
+    for end, sign in ((low, -1), (high, 1)):
+        at = np.clip(logit + sign * moved, -700, 700)
+        end[both] = bottom[both] + width / (1 + np.exp(-at))
     return low, high
