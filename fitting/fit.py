@@ -52,7 +52,8 @@ class Fit:
         simulated, wanted: points [m] of each state, shape (strands, points, 3); the simulated
             ones moved onto the wanted ones where the target asks for that. A state that wants
             other numbers has none in `wanted`.
-        steps: simulations that it took. seconds: compilation included.
+        steps: simulations with their derivatives that it took, those of line searches too.
+        seconds: compilation included.
         problem: that was solved, for `fitting.profile`.
     """
 
@@ -136,7 +137,8 @@ def fit(
         free: from a leaf's name to its constraint, see `Parameters`.
         method: "levenberg-marquardt" with forward-mode Jacobians for few parameters; "adam" or
             "l-bfgs" with reverse-mode gradients for many.
-        steps: largest number of the optimiser's steps, each a simulation with its derivatives.
+        steps: largest number of the optimiser's steps, each a simulation with its derivatives, or
+            as many as the line search of L-BFGS tries.
         tolerance: relative, at which a fit has converged.
         learning_rate: of Adam, in free numbers.
         noise_mm: standard error of points [mm] whose target gives none.

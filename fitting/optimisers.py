@@ -26,7 +26,7 @@ class Optimum(NamedTuple):
     """Where an optimiser ended.
 
     free: free numbers, shape (n,). cost: half the sum of squared residuals, or of their losses.
-    simulations: that it took. converged. reason: why it ended there.
+    simulations: that it took, those of line searches too. converged. reason: why it ended there.
     """
 
     free: np.ndarray
@@ -116,6 +116,9 @@ def gradient_descent(
 ) -> Optimum:
     """Adam or L-BFGS on the mean square, until it falls no more by the relative tolerance.
 
+    A step of Adam takes one simulation with its gradient, one of L-BFGS as many as its line search
+    tries; the last of them is the next step's.
+
     Of a journal's parts the last one counts: the optimiser as it was after a number of steps.
     """
 
@@ -127,48 +130,54 @@ def gradient_descent(
         optimiser = optax.with_extra_args_support(optax.adam(learning_rate))
     else:
         optimiser = optax.lbfgs()
-    value_and_gradient = jax.value_and_grad(loss)
+
+    def value_and_gradient(free: Array, memory: Any) -> tuple[Array, Array, Any]:
+        """Also whether they were simulated: 1, or 0 if the line search left them."""
+        if method == "adam":
+            return *jax.value_and_grad(loss)(free), 1
+        new = ~jnp.isfinite(optax.tree_utils.tree_get(memory, "value"))
+        return *optax.value_and_grad_from_state(loss)(free, state=memory), new
 
     @jax.jit
-    def update(free: Array, memory: Any) -> tuple[Array, Any, Array]:
-        value, gradient = value_and_gradient(free)
+    def update(free: Array, memory: Any) -> tuple[Array, Any, Array, Any]:
+        value, gradient, simulated = value_and_gradient(free, memory)
         extra = {"value": value, "grad": gradient, "value_fn": loss}
         change, memory = optimiser.update(gradient, memory, free, **extra)
-        return optax.apply_updates(free, change), memory, value
+        tried = optax.tree_utils.tree_get(memory, "num_linesearch_steps", 0)
+        return optax.apply_updates(free, change), memory, value, (simulated, tried)
 
-    def ended(free: Any, steps: int, converged: bool, reason: str) -> Optimum:
-        return Optimum(
-            np.asarray(free, float), least[-1] * problem.size / 2, steps, converged, reason
-        )
+    def ended(free: Any, converged: bool, reason: str) -> Optimum:
+        cost = least[-1] * problem.size / 2
+        return Optimum(np.asarray(free, float), cost, taken, converged, reason)
 
     free = problem.start
-    memory = optimiser.init(free)
+    memory, taken = optimiser.init(free), 0
     best, least = free, [np.inf]  # lowest loss after each step; Adam's own goes up and down
     if journal is not None and journal.parts:
         newest = journal.parts[-1]
         kept = unnamed("optimiser", newest, (free, memory, best))
         free, memory, best = jax.tree.map(jnp.asarray, kept)
-        least = [float(x) for x in newest["least"]]
+        least, taken = [float(x) for x in newest["least"]], int(newest["taken"])
     patience = 25 if method == "adam" else 3
     written = time.monotonic()
     for step in range(len(least), steps + 1):
-        new, memory, value = update(free, memory)
-        loss_now = float(value)
+        new, memory, value, simulated = update(free, memory)
+        loss_now, taken = float(value), taken + sum(int(number) for number in simulated)
         if progress is not None:
-            progress(step, float(np.sqrt(loss_now)))
+            progress(taken, float(np.sqrt(loss_now)))
         if not np.isfinite(loss_now):
-            return ended(best, step, False, "values were not finite")
+            return ended(best, False, "values were not finite")
         if loss_now < least[-1]:
             best = free
         least.append(min(loss_now, least[-1]))
         if step > patience and least[-1] > (1 - tolerance) * least[-1 - patience]:
-            return ended(best, step, True, REASONS[2])
+            return ended(best, True, REASONS[2])
         free = new
         if journal is not None and time.monotonic() - written > JOURNAL_SECONDS:
             state = named("optimiser", (free, memory, best))
-            journal.add({**state, "least": np.array(least)}, alone=True)
+            journal.add({**state, "least": np.array(least), "taken": np.array(taken)}, alone=True)
             written = time.monotonic()
-    return ended(best, steps, False, REASONS[0])
+    return ended(best, False, REASONS[0])
 
 
 def rms(residuals: np.ndarray) -> float:

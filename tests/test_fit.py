@@ -106,6 +106,41 @@ def test_gradient_methods_find_the_same_curl(method: str) -> None:
     assert found.residual_mm < 0.1
 
 
+@jh.pytree
+class Counted(fitting.Helix):
+    """A helix that notes every simulation that is compared with it."""
+
+    def residuals(self, state: jh.State, lengths: jax.Array) -> jax.Array:
+        jax.debug.callback(lambda: COMPARED.append(1))
+        return super().residuals(state, lengths)
+
+
+COMPARED: list[int] = []
+
+
+@pytest.mark.parametrize(("method", "later"), [("levenberg-marquardt", 0), ("l-bfgs", 1)])
+def test_all_simulations_are_counted(method: str, later: int) -> None:
+    """Those of a line search too. The result's Jacobian takes another one, if it is not kept."""
+    hair = jh.Strands.straight(np.zeros((1, 3)), (0.0, 0.0, -1.0), length=0.1, points=7)
+    scene = jh.Scene(hair, phases=treatments.water_set(rod_diameter=30e-3)[:-1])
+    told: list[int] = []
+    COMPARED.clear()
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # for optax
+        found = fitting.fit(
+            scene,
+            {"water set, unloaded": Counted(80e-3, 0.0)},
+            {"bonds.influence": fitting.Simplex()},
+            method=method,
+            steps=4,
+            retries=0,
+            progress=lambda simulations, misfit: told.append(simulations),
+        )
+    jax.effects_barrier()
+    assert len(COMPARED) == found.steps + later
+    assert told[-1] == found.steps
+    assert (found.steps > len(told)) == (method == "l-bfgs")
+
+
 def test_a_rod_shared_by_phases_is_one_parameter() -> None:
     hair = jh.Strands.straight(np.zeros((1, 3)), (0.0, 0.0, -1.0), length=0.1, points=21)
     phases = treatments.perm(rod_diameter=15e-3, climb=0.2, seconds=0.02, free=(jh.Hold(),))
