@@ -7,7 +7,7 @@ from jaxhair.contact import HairContact
 from jaxhair.direct import Direct
 from jaxhair.export import save
 from jaxhair.fibre import Fibre, PhysicalFibre, Soften
-from jaxhair.files import Curves, read_curves, write_curves
+from jaxhair.files import Curves, read_curves, read_strands, write_curves
 from jaxhair.forces import Drag, DryingWind, Gravity, TipForce, Wind
 from jaxhair.holding import Hold, Unloaded, Wound
 from jaxhair.obstacles import Cylinder, Floor, Sphere
@@ -52,6 +52,7 @@ __all__ = [
     "named_leaves",
     "pytree",
     "read_curves",
+    "read_strands",
     "replace_leaves",
     "run",
     "save",

@@ -130,12 +130,9 @@ def read_curves(
     FileNotFoundError and other OSError where it cannot be opened.
     """
     path = check.path("path", path)
-    reader, _ = _format(path)
-    _check_unit(unit, up)
     check.flag("skip_short", skip_short)
-    data = contents(path)
+    points, counts = _read(path, unit, up)
     try:
-        points, counts = reader(data)
         short = counts < 2
         if np.any(short):
             if not skip_short:
@@ -154,13 +151,44 @@ def read_curves(
                 f"point {row - int(ends[strand] - counts[strand])} of strand {strand} is "
                 f"{points[row].tolist()}; coordinates must be finite"
             )
-        with np.errstate(over="ignore"):  # reported by Curves
-            points = points.astype(np.float64) * unit
-        if up == "y":
-            points = points[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
-        return Curves(_padded(points, counts), counts)
+        return Curves(_padded(_metres(points, unit, up), counts), counts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def read_strands(
+    path: str | os.PathLike[str], *, unit: float = 1.0, up: Literal["y", "z"] = "z"
+) -> list[NDArray[np.float64]]:
+    """Every strand of a file as it is: points [m], Z up, each of shape (its points, 3).
+
+    As `read_curves`, for those who sort strands out by themselves: strands may have no or one
+    point, any coordinates, and be of very different lengths. Only a file that is truncated, of
+    another format or inconsistent is refused.
+    """
+    path = check.path("path", path)
+    points, counts = _read(path, unit, up)
+    points, ends = _metres(points, unit, up), np.cumsum(counts)
+    return [points[end - count : end] for count, end in zip(counts, ends, strict=True)]
+
+
+def _read(path: Path, unit: float, up: str) -> tuple[Points, Counts]:
+    """Points in the file's unit and axes, shape (all points, 3), and counts of the strands."""
+    reader, _ = _format(path)
+    _check_unit(unit, up)
+    data = contents(path)
+    try:
+        return reader(data)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _metres(points: Points, unit: float, up: str) -> Points:
+    """Points of a file in metres and Z up."""
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is for others to judge
+        points = points.astype(np.float64) * unit
+        if up == "y":
+            points = points[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
+    return points
 
 
 def write_curves(

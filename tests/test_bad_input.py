@@ -134,6 +134,7 @@ CASES: dict[str, Case] = {
     "read_curves": (
         jh.read_curves, {"path": "there.hair", "unit": 1.0, "up": "z", "skip_short": False}
     ),
+    "read_strands": (jh.read_strands, {"path": "there.hair", "unit": 1.0, "up": "z"}),
     "write_curves": (
         write, {"path": "a.hair", "curves": CURVES, "unit": 1.0, "up": "z", "overwrite": True}
     ),

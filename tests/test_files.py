@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxhair.arrays import read_arrays, write_arrays
-from jaxhair.files import Curves, read_curves, write_curves
+from jaxhair.files import Curves, read_curves, read_strands, write_curves
 
 ENDINGS = [".hair", ".data", ".npz"]
 
@@ -853,3 +853,23 @@ def test_write_arrays_keeps_an_existing_file(tmp_path):
     assert path.read_text() == "old"
     write_arrays(path, {"a": 1}, overwrite=True)
     assert read_arrays(path)["a"] == 1
+
+
+def test_strands_as_they_are(tmp_path):
+    """Empty strands, single points, NaN and very different lengths, which `read_curves` refuses."""
+    longest = np.arange(3 * 4000, dtype="<f4").reshape(-1, 3)
+    strands = [np.zeros((0, 3)), [[1, 2, 3]], A, [[1, np.nan, 3], [4, 5, np.inf]], longest]
+    data, path = data_bytes(*strands), tmp_path / "a.data"
+    path.write_bytes(data)
+    found = read_strands(path, unit=0.01, up="y")
+    assert len(found) == len(strands)
+    for got, wanted in zip(found, strands, strict=True):
+        x, y, z = np.reshape(wanted, (-1, 3)).T
+        np.testing.assert_allclose(got, 0.01 * np.stack([x, -z, y], axis=1))
+    with pytest.raises(ValueError, match="fewer than 2 points"):
+        read_curves(path)
+    path.write_bytes(data[:-1])
+    with pytest.raises(ValueError, match=r"a\.data.*strand 4 has 4000 points"):
+        read_strands(path)
+    write_curves(tmp_path / "b.hair", Curves.from_list([]))
+    assert read_strands(tmp_path / "b.hair") == []
