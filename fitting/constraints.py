@@ -5,6 +5,7 @@ A constraint maps free numbers, in which the optimiser moves without bounds, to 
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,9 @@ import numpy as np
 from jax import Array
 
 from jaxhair import check
+
+LARGEST_SHAPE = 0.8
+"""Of |Omega|, half the sine of a turn, that a strand may remember: a turn of 106 degrees."""
 
 
 class Constraint:
@@ -103,6 +107,57 @@ class Unbounded(Constraint):
 
     def value(self, free: Array, start: np.ndarray) -> Array:
         return free.reshape(start.shape)
+
+
+@dataclass(frozen=True)
+class Scale(Constraint):
+    """The starting value times one number above 0, k = exp(x): for `strands.natural_shape`.
+
+    Shapes Omega stay at most `LARGEST_SHAPE` in size, or as large as they start.
+    """
+
+    def free(self, value: np.ndarray) -> np.ndarray:
+        return np.zeros(1)
+
+    def value(self, free: Array, start: Any) -> Array:
+        start = jnp.asarray(start, free.dtype)
+        scaled = start * jnp.exp(free[0])
+        square = jnp.sum(scaled**2, axis=-1, keepdims=True)
+        most = jnp.maximum(jnp.sum(start**2, axis=-1, keepdims=True), LARGEST_SHAPE**2)
+        over = square > most
+        return scaled * jnp.where(over, jnp.sqrt(most / jnp.where(over, square, 1)), 1)
+
+
+@dataclass(frozen=True)
+class Share(Constraint):
+    """One of several numbers against all others: their sum stays, and the others' ratios.
+
+    For influences: a single state rarely shows more than one. v = sum / (1 + exp(-x)).
+
+    Arguments:
+        place: of the number.
+    """
+
+    place: int
+
+    def free(self, value: np.ndarray) -> np.ndarray:
+        if value.ndim != 1 or not 0 <= self.place < value.size or np.any(value < 0):
+            raise ValueError(f"value is {check.short(value)}; it must be a list of numbers >= 0")
+        own, whole = value[self.place], value.sum()
+        if own == whole:
+            raise ValueError(f"value is {check.short(value)}; another number must be above 0")
+        share = np.clip(own / whole, 1e-6, 1 - 1e-6)
+        return np.array([np.log(share / (1 - share))])
+
+    def value(self, free: Array, start: Any) -> Array:
+        start = jnp.asarray(start, free.dtype)
+        whole, others = jnp.sum(start), start.at[self.place].set(0)
+        share = jax.nn.sigmoid(free[0])
+        rest = others * ((1 - share) * whole / jnp.sum(others))
+        return rest.at[self.place].set(share * whole)
+
+    def bounds(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(start.shape), np.full(start.shape, start.sum())
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ derivatives by one compiled program; Levenberg and Marquardt's steps are taken o
 with a damping for each strand.
 """
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,18 +16,17 @@ import numpy as np
 
 from fitting import tiles
 from fitting.constraints import Constraint
+from fitting.levenberg_marquardt import levenberg_marquardt
 from fitting.optimisers import Progress
 from fitting.problem import checked
 from fitting.targets import MM, Shape, Target
-from fitting.tiles import Squares, Tiles
+from fitting.tiles import TILE, Tiles
 from jaxhair import HairContact, Scene, check
+from jaxhair.checkpoints import Checkpoints
 from jaxhair.effects import of_kind
 
-TILE = 64
-"""Strands simulated together: the fastest of `tests/benchmarks/many_strands.py`."""
-
-FIRST_DAMPING, LARGEST_DAMPING = 1e-3, 1e12
-"""Relative to the diagonal of the normal equations."""
+SHARES = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+"""Of the strands, at which distributions are shown."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,9 @@ class FitEach:
         """Time, quantiles of the residual, and of the numbers of those that were fitted."""
         fitted = self.fitted
         lines = [f"{self.seconds:.0f} s, at most {self.steps.max()} simulations a strand"]
-        known = self.residual_mm[np.isfinite(self.residual_mm)]
-        if known.size:
-            shares = (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)
-            found = ", ".join(
-                f"{q:.0%} {x:.3g}" for q, x in zip(shares, np.quantile(known, shares), strict=True)
-            )
-            lines.append(f"residual [mm], share of strands at or below: {found}")
+        lines += [
+            f"residual [mm] of this share of strands at most: {distribution(self.residual_mm)}"
+        ]
         if not fitted.any():
             return lines
         rows: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -99,6 +95,18 @@ class FitEach:
         return "\n".join(lines)
 
 
+def quantiles(values: np.ndarray) -> np.ndarray:
+    """What `SHARES` of the values that are finite do not exceed; NaN where none is finite."""
+    known = values[np.isfinite(values)]
+    return np.quantile(known, SHARES) if known.size else np.full(len(SHARES), np.nan)
+
+
+def distribution(values: np.ndarray) -> str:
+    """`quantiles` as text."""
+    pairs = zip(SHARES, quantiles(values), strict=True)
+    return ", ".join(f"{share:.0%} {value:.3g}" for share, value in pairs)
+
+
 def fit_each(
     scene: Scene,
     targets: Mapping[str, Target],
@@ -111,6 +119,7 @@ def fit_each(
     bar_mm: float | None = None,
     tile: int | None = None,
     progress: Progress | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> FitEach:
     """The numbers of each strand with which it takes its wanted shape.
 
@@ -136,11 +145,14 @@ def fit_each(
             twentieth of the strand's length.
         tile: strands that are simulated together.
         progress: called with the number of simulations so far and the residual of all [mm].
+        checkpoint: a folder in which the strands are kept after each simulation of all; as for
+            `fitting.fit`, the same fit goes on from there to the same result bit for bit.
 
     Tiles go to `jax.devices()` in turn. A strand that has converged is simulated no more.
 
     Raises ValueError for an unknown phase or leaf, a leaf that cannot differ between strands,
-    targets of other numbers than points, and hair that touches hair.
+    targets of other numbers than points, hair that touches hair, and a checkpoint that is of other
+    work or damaged.
     """
     check.instance("scene", scene, Scene)
     check.whole("steps", steps, least=1)
@@ -153,8 +165,17 @@ def fit_each(
     parameters = tiles.freed(scene, free)
     problem = Tiles(scene, _checked(scene, targets), parameters, noise_mm, tile or TILE)
     start = np.concatenate([tiles.numbers(p) for p in parameters], axis=1)
-    found = _levenberg_marquardt(
-        problem, start, steps, tolerance, prior_width, progress or (lambda step, residual: None)
+    journal = None
+    if checkpoint is not None:
+        journal = Checkpoints(checkpoint, _work(problem, (steps, tolerance, prior_width)))
+    found = levenberg_marquardt(
+        problem,
+        start,
+        steps=steps,
+        tolerance=tolerance,
+        prior_width=prior_width,
+        progress=progress or (lambda step, residual: None),
+        journal=journal,
     )
     reasons = list(found.reasons)
     for i, (residual, bar) in enumerate(zip(found.sums.residual_mm, bars, strict=True)):
@@ -201,6 +222,19 @@ def _checked(scene: Scene, targets: Mapping[str, Target]) -> dict[str, Target]:
     return by_phase
 
 
+def _work(problem: Tiles, settings: tuple[float, ...]) -> Any:
+    """All that the strands depend on after each step."""
+    return {
+        "scene": problem.scene,
+        "targets": problem.targets,
+        "free": repr([(p.name, p.constraint) for p in problem.parameters]),
+        "weights": problem.weights,
+        "settings": repr(settings),
+        # tells apart what the numbers do not: another effect, target or constraint of the same name
+        "program": problem.program(),
+    }
+
+
 def _bars(scene: Scene, bar_mm: float | None) -> np.ndarray:
     """The largest residual of each strand that counts as fitted [mm]."""
     if bar_mm is not None:
@@ -209,104 +243,8 @@ def _bars(scene: Scene, bar_mm: float | None) -> np.ndarray:
     return np.broadcast_to(lengths / 20, (scene.strands.count,))
 
 
-@dataclass
-class _Found:
-    """Free numbers of the strands, the sums there, and how each ended."""
-
-    x: np.ndarray
-    sums: Squares
-    converged: np.ndarray
-    reasons: list[str | None]
-    steps: np.ndarray
-
-
-def _levenberg_marquardt(
-    problem: Tiles,
-    start: np.ndarray,
-    steps: int,
-    tolerance: float,
-    prior_width: float,
-    progress: Progress,
-) -> _Found:
-    """Steps d of (A + mu diag A) d = -g, with the damping mu of each strand by its gain ratio
-    (Nielsen, Damping parameter in Marquardt's method, 1999).
-    """
-    count, n = start.shape
-    everyone = np.arange(count)
-    now = _Found(
-        start.copy(),
-        problem.evaluate(start, everyone),
-        np.zeros(count, bool),
-        [None] * count,
-        np.ones(count, int),
-    )
-    progress(1, _rms(now.sums.residual_mm))
-    alive = now.sums.finite
-    for i in everyone[~alive]:
-        now.reasons[i] = "not finite at its start"
-    damping, growth = np.full(count, FIRST_DAMPING), np.full(count, 2.0)
-    for step in range(2, steps + 1):
-        at = everyone[alive & ~now.converged]
-        total, g, a = _whole(now, start, at, prior_width)
-        enough = tolerance * (1 + total / problem.residuals)
-        newton = _solved(a, -g)
-        near = -(g * newton).sum(axis=1) <= enough
-        now.converged[at[near]] = True
-        at, total, g, a, enough = (x[~near] for x in (at, total, g, a, enough))
-        if not at.size:
-            break
-        diagonal = np.einsum("sii->si", a)
-        d = _solved(a + damping[at, None, None] * diagonal[:, :, None] * np.eye(n), -g)
-        # no further at once than is plausible at all
-        d /= np.maximum(np.abs(d).max(axis=1, keepdims=True) / prior_width, 1)
-        expected = -2 * (g * d).sum(axis=1) - np.einsum("si,sij,sj->s", d, a, d)
-        new = problem.evaluate(now.x[at] + d, at)
-        prior = ((now.x[at] + d - start[at]) ** 2).sum(axis=1) / prior_width**2
-        with np.errstate(all="ignore"):
-            gain = np.where(new.finite, (total - new.square - prior) / expected, -np.inf)
-        better = gain > 1e-3
-        good, bad = at[better], at[~better]
-        now.x[good] += d[better]
-        for old, value in zip(now.sums, new, strict=True):
-            old[good] = value[better]
-        now.steps[at] = step
-        damping[good] *= np.maximum(1 / 3, 1 - (2 * np.minimum(gain[better], 1) - 1) ** 3)
-        growth[good] = 2
-        damping[bad] *= growth[bad]
-        growth[bad] *= 2
-        # what is left to gain is less than the simulation's rounding
-        now.converged[bad] = ((expected < 100 * enough) & new.finite)[~better]
-        for i in bad[damping[bad] > LARGEST_DAMPING]:
-            alive[i], now.reasons[i] = False, "no step lowers its residual"
-        progress(step, _rms(now.sums.residual_mm))
-    for i in everyone[alive & ~now.converged]:
-        now.reasons[i] = f"not converged in {steps} steps"
-    return now
-
-
-def _whole(now: _Found, start: np.ndarray, at: np.ndarray, prior_width: float) -> tuple[Any, ...]:
-    """F, half its gradient g and half its second derivatives A of some strands, prior included."""
-    away, weight = now.x[at] - start[at], 1 / prior_width**2
-    return (
-        now.sums.square[at] + weight * (away**2).sum(axis=1),
-        now.sums.slope[at] + weight * away,
-        now.sums.curvature[at] + weight * np.eye(start.shape[1]),
-    )
-
-
-def _solved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """x of a x = b for each strand."""
-    return np.linalg.solve(a, b[..., None])[..., 0]
-
-
 def _inverse(a: np.ndarray) -> np.ndarray:
     """Of each strand's matrix; NaN where that is not finite."""
     finite = np.isfinite(a).all(axis=(1, 2))
     safe = np.where(finite[:, None, None], a, np.eye(a.shape[-1]))
     return np.where(finite[:, None, None], np.linalg.inv(safe), np.nan)
-
-
-def _rms(residual_mm: np.ndarray) -> float:
-    """Of all strands whose residual is known; NaN if none is."""
-    known = residual_mm[np.isfinite(residual_mm)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")

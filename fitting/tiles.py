@@ -16,6 +16,9 @@ from fitting.targets import MM, Shape, Target
 from jaxhair import Scene, check, named_leaves, run
 from jaxhair.strands import strands_last
 
+TILE = 64
+"""Strands simulated together: the fastest of `tests/benchmarks/many_strands.py`."""
+
 
 @dataclass(frozen=True)
 class Freed:
@@ -134,7 +137,7 @@ class Tiles:
         of_strands = {
             i: np.asarray(leaf)
             for i, (name, leaf) in enumerate(zip(names, leaves, strict=True))
-            if i not in freed and _has_strands(name, leaf, scene.strands.count)
+            if i not in freed and has_strands(name, leaf, scene.strands.count)
         }
         self.shared = {i: x for i, x in enumerate(leaves) if i not in of_strands}
         shapes = {n: t.strands for n, t in targets.items() if isinstance(t, Shape)}
@@ -147,6 +150,11 @@ class Tiles:
         self._evaluate = jax.jit(self._residuals_and_jacobian)
         self.weights = MM / noise_mm * np.concatenate(self._sizes(noise_mm))
         self.residuals = self.weights.size
+
+    def program(self) -> str:
+        """The compiled program, as text."""
+        x = np.zeros((sum(p.size for p in self.parameters), self.tile), self.scene.dtype)
+        return str(self._evaluate.lower(x, self._tile(np.arange(self.tile))).as_text())
 
     def _sizes(self, noise_mm: float) -> list[np.ndarray]:
         """Of each target noise_mm over its own error, as often as it has residuals a strand.
@@ -251,7 +259,7 @@ class Tiles:
         return Squares(square, slope, curvature, residual)
 
 
-def _has_strands(name: str, leaf: Any, strands: int) -> bool:
+def has_strands(name: str, leaf: Any, strands: int) -> bool:
     """Whether a leaf's first axis is that of the strands."""
     if name.startswith("strands."):
         return len(leaf) == strands

@@ -210,6 +210,23 @@ def tiny_fit(
     )
 
 
+def tiny_fit_each(checkpoint: str | None) -> fitting.FitEach:
+    """How stiff is each of some strands that sag?"""
+    roots = 0.01 * np.arange(9.0).reshape(3, 3)
+    hair = jh.Strands.straight(roots, (1.0, 0, 0), length=0.1, points=4)
+    sagging = (jh.Phase("a", 8 * DT, (jh.Hold(), jh.Gravity())),)
+    truth = jh.Scene(hair, jh.Fibre(np.array([0.02, 0.1, 0.4])), phases=sagging)
+    wanted = np.asarray(jh.run(truth)["a"].points) + 1e-4 * np.sin(np.arange(36.0)).reshape(3, 4, 3)
+    return fitting.fit_each(
+        jh.Scene(hair, phases=sagging),
+        {"a": fitting.Shape(wanted)},
+        {"fibre.stiffness": fitting.Interval(1e-3, 0.9)},
+        tolerance=1e-9,
+        tile=2,
+        checkpoint=checkpoint,
+    )
+
+
 @pytest.mark.parametrize(
     "method",
     ["levenberg-marquardt", "adam", pytest.param("l-bfgs", marks=pytest.mark.slow)],
@@ -302,6 +319,9 @@ def work(what: str, folder: str | None) -> dict[str, Any]:
         options: dict[str, Any] = {"checkpoint": folder, "checkpoint_seconds": 0.0}
         movie = jh.simulate(scene(), fps=360, **options)
         return {"positions": movie.positions, "fractions": movie.fractions}
+    if what == "fit each":
+        each = tiny_fit_each(folder)
+        return {"residuals": each.residual_mm, "steps": each.steps, **each.values}
     found = tiny_fit(folder, "levenberg-marquardt")
     return {"simulated": found.simulated["a"], "steps": found.steps, **found.values}
 
@@ -316,7 +336,7 @@ def killed_and_finished(tmp_path: Path, what: str, kills: int, seed: int) -> Non
     program = WORK.format(tests=str(Path(__file__).parent))
     whole = {name: np.asarray(x) for name, x in work(what, None).items()}
     folder, result = tmp_path / "folder", tmp_path / "result.npz"
-    rng, killed, parts = random.Random(seed), 0, 0
+    rng, killed, newest = random.Random(seed), 0, -1
     while True:
         command = [sys.executable, "-c", program, what, str(folder), str(result)]
         with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as process:
@@ -332,8 +352,9 @@ def killed_and_finished(tmp_path: Path, what: str, kills: int, seed: int) -> Non
         killed += process.returncode == -signal.SIGKILL
         for path in (*folder.glob("[!.]*"), *tmp_path.glob("*.npz")):
             read_arrays(path)  # whole
-        assert len(list(folder.glob("[!.]*"))) >= parts  # and none is lost
-        parts = len(list(folder.glob("[!.]*")))
+        numbers = [int(path.stem.removeprefix("part-")) for path in folder.glob("[!.]*")]
+        assert max(numbers, default=-1) >= newest  # and none is lost
+        newest = max(numbers, default=-1)
         if not result.exists():
             assert process.returncode == -signal.SIGKILL
             continue
@@ -343,19 +364,19 @@ def killed_and_finished(tmp_path: Path, what: str, kills: int, seed: int) -> Non
             np.testing.assert_array_equal(found[name], whole[name])
         if killed >= kills:
             break
-        parts = 0
+        newest = -1
         for path in (result, *folder.iterdir()):  # it was faster: once more
             path.unlink()
     assert not list(folder.glob(".*"))  # nothing is left of what was killed
 
 
-@pytest.mark.parametrize("what", ["simulation", "fit"])
+@pytest.mark.parametrize("what", ["simulation", "fit", "fit each"])
 def test_killed_twice(tmp_path: Path, what: str) -> None:
     killed_and_finished(tmp_path, what, 2, seed=1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["simulation", "fit"])
+@pytest.mark.parametrize("what", ["simulation", "fit", "fit each"])
 def test_killed_15_times(tmp_path: Path, what: str) -> None:
     killed_and_finished(tmp_path, what, 15, seed=2)
 

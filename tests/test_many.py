@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import pytest
 
 import fitting
 import jaxhair as jh
+from fitting import tiles
 from fitting.many import FitEach, fit_each
 
 ROD, STIFFNESS = "phases.*.Wound.diameter", "fibre.stiffness"
@@ -115,6 +117,73 @@ def test_standard_errors_are_those_of_repeated_measurements() -> None:
         off = (found.values[name] - true) / found.errors[name]
         assert 0.75 < np.sqrt(np.mean(off**2)) < 1.25
         assert np.mean(np.abs(off) < 1.96) > 0.85
+
+
+def test_a_fit_goes_on_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted in the 1st, 3rd and 4th simulation of all; one strand is not finite."""
+    wanted = observed() + np.random.default_rng(0).normal(0, 3e-4, observed().shape)
+    wanted[1] = np.nan
+    target = jax.tree.map(lambda x: wanted, fitting.Shape(observed()))
+
+    def found(checkpoint: Path | None, told: list[int]) -> FitEach:
+        options: dict[str, Any] = {"tolerance": 1e-8, "tile": 2, "checkpoint": checkpoint}
+        return fit_each(
+            scene(3),
+            {"water set": target},
+            FREE,
+            progress=lambda step, mm: told.append(step),
+            **options,
+        )
+
+    whole = found(None, [])
+    assert whole.reasons == (None, "not finite at its start", None)
+    true = tiles.Tiles.evaluate
+    for calls, done in ((0, []), (2, [1, 2]), (1, [2, 3])):
+        left, told = [calls], list[int]()
+
+        def evaluate(*arguments: Any, left: list[int] = left) -> Any:
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return true(*arguments)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(tiles.Tiles, "evaluate", evaluate)
+            with pytest.raises(KeyboardInterrupt):
+                found(tmp_path, told)
+        assert told == done
+    rest: list[int] = []
+    for again in (found(tmp_path, rest), found(tmp_path, [])):
+        same(again, whole)
+    assert rest == list(range(3, whole.steps.max() + 1))
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def same(one: FitEach, other: FitEach) -> None:
+    """Bit for bit, but for the time."""
+    assert one.reasons == other.reasons
+    for name in set(vars(one)) - {"seconds", "reasons"}:
+        jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(other, name))
+
+
+def test_a_folder_of_other_work_is_refused(tmp_path: Path) -> None:
+    def run(start: jh.Scene, wanted: np.ndarray, **options: Any) -> None:
+        target = {"water set": fitting.Shape(wanted)}
+        one = {ROD: FREE[ROD], **options.pop("free", {})}
+        fit_each(start, target, one, steps=1, checkpoint=tmp_path, **options)
+
+    run(scene(2), observed()[:2])
+    run(scene(2), observed()[:2])
+    changes: list[tuple[Any, Any, dict[str, Any]]] = [
+        (scene(2, stiffness=0.016), observed()[:2], {}),
+        (scene(2), observed()[1:], {}),
+        (scene(2), observed()[:2], {"free": {ROD: fitting.Interval(8e-3, 41e-3)}}),
+        (scene(2), observed()[:2], {"tolerance": 1e-5}),
+        (scene(2), observed()[:2], {"noise_mm": 0.2}),
+    ]
+    for start, wanted, options in changes:
+        with pytest.raises(ValueError, match="other work"):
+            run(start, wanted, **options)
 
 
 class Scale(fitting.Constraint):

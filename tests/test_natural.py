@@ -1,7 +1,7 @@
 """Natural strands: what they must remember, and what can be fitted of them."""
 
-import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,8 +11,13 @@ import pytest
 
 import fitting
 import jaxhair as jh
+from fitting import hanging
+from fitting.constraints import Scale, Share
+from fitting.hanging import held_up, without_weight
 from fitting.many import FitEach, fit_each
-from fitting.natural import STATE, UNLOADED, Scale, Share, natural, without_weight
+from fitting.natural import STATE, UNLOADED, natural
+from fitting.polylines import evenly
+from jaxhair.checkpoints import Checkpoints
 
 
 def helix(diameter: float, length: float, points: int = 60) -> np.ndarray:
@@ -56,7 +61,7 @@ def test_what_weight_bends_is_a_cantilevers_moment() -> None:
 def test_strands_hang_as_they_were_seen_and_others_are_listed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(sys.modules["fitting.natural"], "STAYS", 1e-3)
+    monkeypatch.setattr(hanging, "STAYS", 1e-3)
     good = iter(CURLS)
     strands = [BAD[i][0] if i in BAD else next(good) for i in range(9)]
     hair = natural(strands, points=17, seconds=0.1)
@@ -70,11 +75,59 @@ def test_strands_hang_as_they_were_seen_and_others_are_listed(
     remembered = hair.scene.strands.natural_shape
     assert float(jnp.mean(remembered**2)) > float(jnp.mean(seen**2))
 
+    assert hair.lengths == pytest.approx([0.06, 0.05, 0.07], rel=0.02)
     ones, reasons = np.ones(3), (None, "lost", None)
     found = FitEach({}, {}, {}, {}, ones, ones > 0, reasons, ones, 1.0)
     table = hair.table(found)
     assert table.startswith("2 of 9 strands fitted")
     assert "strand 4: lost\nstrand 5: not finite" in table
+
+
+def test_the_search_for_stiffness_goes_on_from_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of long hair that stands out level: it needs more stiffness than a hair has, and gets it."""
+    x = np.zeros((3, 17, 3))
+    x[:, :, 0] = np.linspace(0, 1, 17) * np.array([[0.02], [0.1], [0.25]])
+    phases = jh.treatments.wash(name=STATE, seconds=0.05, unload=False)
+    hair = jh.Strands.from_points(jnp.asarray(x, "float32"))
+    scene = jh.Scene(hair, jh.PhysicalFibre(), phases=phases, solver=jh.Direct())
+    told: list[tuple[int, int]] = []
+    shape, stiffer = held_up(scene, STATE, progress=lambda *counts: told.append(counts))
+    assert list(stiffer) == [1, 1, 4]
+    # the third would have to remember too sharp a bend at first: it is not even simulated
+    assert told == [(2, 3), (3, 0)]
+    true = Checkpoints.add
+
+    def add(self: Checkpoints, *arguments: Any, **more: Any) -> None:
+        true(self, *arguments, **more)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "add", add)
+        with pytest.raises(KeyboardInterrupt):
+            held_up(scene, STATE, checkpoint=tmp_path)
+    again: list[tuple[int, int]] = []
+    found = held_up(
+        scene, STATE, checkpoint=tmp_path, progress=lambda *counts: again.append(counts)
+    )
+    np.testing.assert_array_equal(found[0], shape)
+    np.testing.assert_array_equal(found[1], stiffer)
+    assert again == [(1, 0)]  # the first round was kept
+    with pytest.raises(ValueError, match="other work"):
+        held_up(replace(scene, fibre=jh.PhysicalFibre(radius=5e-5)), STATE, checkpoint=tmp_path)
+
+
+def test_resampling_says_what_it_loses() -> None:
+    """Of a circle: chords of half the turn fall short by r (1 - cos) at their middles."""
+    angle = np.linspace(0, 2 * np.pi, 2001)
+    circle = 0.01 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    shapes, off = evenly([circle, circle[:2], circle[:1001]], 21)
+    sagitta = 10 * (1 - np.cos(np.pi / 20))
+    assert off[0] == pytest.approx(sagitta * np.sqrt(8 / 15), rel=0.01)  # of a parabola
+    assert off[1] < 1e-12
+    assert off[2] == pytest.approx(off[0] / 4, rel=0.02)
+    assert np.linalg.norm(shapes[:, 0] - circle[0], axis=1).max() < 1e-15
 
 
 @pytest.mark.slow

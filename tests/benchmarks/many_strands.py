@@ -3,7 +3,7 @@
 Strands of 20 cm and 32 points, each permed on a rod of its own, of hair of its own stiffness, worn
 by its own peeling rate; seen as they hang after the perm with 0.1 mm of noise. From their shapes
 all three numbers of each strand are found again. `--tiles` times an evaluation for some tiles,
-with which `fitting.many.TILE` was chosen.
+with which `fitting.tiles.TILE` was chosen.
 """
 
 import argparse
