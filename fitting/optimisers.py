@@ -144,14 +144,14 @@ def gradient_descent(
         extra = {"value": value, "grad": gradient, "value_fn": loss}
         change, memory = optimiser.update(gradient, memory, free, **extra)
         tried = optax.tree_utils.tree_get(memory, "num_linesearch_steps", 0)
-        return optax.apply_updates(free, change), memory, value, (simulated, tried)
+        return optax.apply_updates(free, change), strong(memory), value, (simulated, tried)
 
     def ended(free: Any, converged: bool, reason: str) -> Optimum:
         cost = least[-1] * problem.size / 2
         return Optimum(np.asarray(free, float), cost, taken, converged, reason)
 
     free = problem.start
-    memory, taken = optimiser.init(free), 0
+    memory, taken = strong(optimiser.init(free)), 0
     best, least = free, [np.inf]  # lowest loss after each step; Adam's own goes up and down
     if journal is not None and journal.parts:
         newest = journal.parts[-1]
@@ -178,6 +178,12 @@ def gradient_descent(
             journal.add({**state, "least": np.array(least), "taken": np.array(taken)}, alone=True)
             written = time.monotonic()
     return ended(best, False, REASONS[0])
+
+
+def strong(tree: Any) -> Any:
+    """Arrays of the same dtypes that are not weakly typed: a loop that begins with weak ones is
+    compiled twice."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), tree)
 
 
 def rms(residuals: np.ndarray) -> float:
