@@ -17,6 +17,7 @@ from fitting.many import FitEach, fit_each
 from fitting.measured import Measured, packaged, read
 from fitting.natural import Natural, natural
 from fitting.parameters import Parameters
+from fitting.posterior import Posterior, posterior
 from fitting.profile import Profile, profile
 from fitting.starts import Basin
 from fitting.strands import from_strands
@@ -41,6 +42,7 @@ __all__ = [
     "PerStrand",
     "PointTarget",
     "Positive",
+    "Posterior",
     "Profile",
     "Shape",
     "Simplex",
@@ -56,6 +58,7 @@ __all__ = [
     "helix",
     "natural",
     "packaged",
+    "posterior",
     "profile",
     "read",
     "resampled",
