@@ -19,7 +19,11 @@ from jaxhair.__main__ import UNITS, length, parsed
 
 FREE: dict[str, Constraint] = {"bonds.influence": Simplex(), "fibre.peeling_rate": Positive()}
 
-COMMANDS = {"design": "fitting.design_command", "published": "fitting.published"}
+COMMANDS = {
+    "design": "fitting.design_command",
+    "natural": "fitting.natural_command",
+    "published": "fitting.published",
+}
 """Commands besides the fit, each a module with a `main`."""
 
 
@@ -29,8 +33,9 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m fitting",
         description="Finds the bond influences f_j and the cuticle's peeling rate s with which "
         "hair takes the wanted curls. Without --target it fits curls measured on real hair that "
-        "come with the package. Other commands: python -m fitting design --help; python -m fitting "
-        "published --help.",
+        "come with the package. Other commands: "
+        + "; ".join(f"python -m fitting {name} --help" for name in COMMANDS)
+        + ".",
         epilog="example: python -m fitting --target permed=a.hair washed=b.hair --output fitted",
     )
     top.add_argument("--output", required=True, metavar="DIR", help="folder for the results")

@@ -72,40 +72,41 @@ def as_json(fit: "Fit", **more: Any) -> dict[str, Any]:
     numbers = zip(spread.labels, spread.values, spread.low, spread.high, strict=True)
     return {
         "parameters": {
-            label: {"value": _plain(value), "interval": _plain([low, high])}
+            label: {"value": plain(value), "interval": plain([low, high])}
             for label, value, low, high in numbers
         },
         "level": spread.level,
-        "correlations": _plain(spread.correlations),
-        "residual_mm": _plain(fit.residual_mm),
-        "residual_mm_by_state": {name: _plain(v) for name, v in fit.residuals_mm.items()},
-        "misfit": _plain(fit.misfit),
-        "misfit_by_state": {name: _plain(v) for name, v in fit.misfits.items()},
+        "correlations": plain(spread.correlations),
+        "residual_mm": plain(fit.residual_mm),
+        "residual_mm_by_state": {name: plain(v) for name, v in fit.residuals_mm.items()},
+        "misfit": plain(fit.misfit),
+        "misfit_by_state": {name: plain(v) for name, v in fit.misfits.items()},
         "converged": fit.converged,
         "reason": fit.reason,
         "at_bounds": list(fit.at_bounds),
-        "basins": [{"misfit": _plain(b.misfit), "starts": b.starts} for b in fit.basins],
+        "basins": [{"misfit": plain(b.misfit), "starts": b.starts} for b in fit.basins],
         "undetermined": [
-            {"change": d.change, "uncertainty": _plain(d.uncertainty)} for d in fit.undetermined
+            {"change": d.change, "uncertainty": plain(d.uncertainty)} for d in fit.undetermined
         ],
-        "singular_values": _plain(fit.singular_values),
+        "singular_values": plain(fit.singular_values),
         "simulations": fit.steps,
         "seconds": fit.seconds,
         "settings": fit.settings,
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": {"python": platform.python_version(), **versions()},
         **more,
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Numbers that JSON has: not finite becomes null."""
     array = np.asarray(value, float)
     if array.ndim == 0:
         return float(array) if np.isfinite(array) else None
-    return [_plain(v) for v in array]
+    return [plain(v) for v in array]
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of the packages that results depend on."""
     found = {}
     for package in PACKAGES:
         try:
