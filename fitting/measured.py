@@ -1,8 +1,8 @@
 """Measured curls from a text file (TOML): the scenes that they were made in, and the targets.
 
 A file has a table [hair] and one or more [[state]]; or several experiments on the same hair, each
-an [[experiment]] with a name, what differs of [hair], `weight = true` where it hangs, and its own
-[[experiment.state]].
+an [[experiment]] with a name, what differs of [hair], how the hair was looked at (see `Seen`), and
+its own [[experiment.state]].
 """
 
 import math
@@ -18,7 +18,21 @@ import numpy as np
 
 from fitting.curls import MEASURES, Curl
 from fitting.targets import Helix, Target
-from jaxhair import Bonds, Drag, Hold, Phase, Scene, Strands, check, treatments
+from jaxhair import (
+    Bonds,
+    Cut,
+    Direct,
+    Drag,
+    Hold,
+    Phase,
+    PhysicalFibre,
+    Scene,
+    Strands,
+    TipForce,
+    Unloaded,
+    check,
+    treatments,
+)
 from jaxhair.arrays import contents, reason
 
 FREE = (Hold(), Drag(0.1))
@@ -36,9 +50,13 @@ TREATMENTS: dict[Any, Callable[..., tuple[Phase, ...]]] = {
 }
 HANGING: dict[str, Any] = {"seconds": 1.0, "free": treatments.HANGING}
 
+G = 9.80
+"""That of `Gravity` [m/s^2]."""
+
 FILE_KEYS = {"title", "hair", "state", "experiment"}
 HAIR_KEYS = {"natural_curl_diameter", "rod_diameter", "length", "points"}
-EXPERIMENT_KEYS = {"name", "weight", "state"} | HAIR_KEYS
+SEEN_KEYS = {"weight", "tip_mass", "hydrogen_left"}
+EXPERIMENT_KEYS = {"name", "state"} | SEEN_KEYS | HAIR_KEYS
 CURL_KEYS = {f"curl_{name}" for name in MEASURES}
 STATE_KEYS = {
     "name",
@@ -52,6 +70,49 @@ STATE_KEYS = {
     *CURL_KEYS,
     *(f"{key}_error" for key in CURL_KEYS),
 }
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How the states of an experiment were looked at.
+
+    Arguments:
+        weight: the hair hangs under its weight, for a second.
+        tip_mass: of a load at each hair's tip then [kg]. All experiments of a file that has one
+            are of hair with the stiffness and weight of real hair, see `PhysicalFibre`.
+        hydrogen_left: fraction of hydrogen bonds that damp air leaves. Which humidity leaves how
+            many is not known here; free "phases.*, damp.Cut.hydrogen" to find it.
+    """
+
+    weight: bool = False
+    tip_mass: float | None = None
+    hydrogen_left: float | None = None
+
+    @classmethod
+    def of(cls, table: dict[str, Any], where: str) -> "Seen":
+        """From an experiment's table. Raises ValueError for a wrong entry."""
+        seen = cls(**{key: table[key] for key in SEEN_KEYS if key in table})
+        check.flag(f"{where}: weight", seen.weight)
+        if seen.tip_mass is not None:
+            check.constant(f"{where}: tip_mass", seen.tip_mass)
+            if not seen.weight:
+                wanted = "it must be left out where weight is not true"
+                raise ValueError(f"{where}: tip_mass is {seen.tip_mass}; {wanted}")
+        if seen.hydrogen_left is not None:
+            check.fraction(f"{where}: hydrogen_left", seen.hydrogen_left)
+        return seen
+
+    def phases(self, made: list[Phase]) -> list[Phase]:
+        """A state's phases, of which the last is looked at, in these circumstances."""
+        last = made[-1]
+        damp: list[Phase] = []
+        if self.hydrogen_left is not None:
+            effects = (Unloaded(), Cut(hydrogen=self.hydrogen_left))
+            damp = [Phase(f"{last.name}, damp", treatments.AT_ONCE, effects)]
+        if self.tip_mass is not None:
+            load = TipForce((0.0, 0.0, -G * self.tip_mass))
+            last = replace(last, effects=(*last.effects, load))
+        return [*made[:-1], *damp, last]
 
 
 @dataclass(frozen=True)
@@ -117,17 +178,22 @@ def _measured(table: dict[str, Any], name: str) -> Measured:
     title = table.get("title", name)
     check.instance("title", title, str)
     if experiments is None:
-        return Measured(title, *_experiment(hair, listed, "", weight=False))
+        return Measured(title, *_experiment(hair, listed, "", Seen(), {}))
     scenes: dict[str, Scene] = {}
     targets: dict[str, dict[str, Target]] = {}
+    loaded = any(isinstance(table, dict) and "tip_mass" in table for table in listed)
+    # one hair, one model of it: a load in newtons needs moduli, and more than one Newton step
+    model: dict[str, Any] = {}
+    if loaded:
+        model = {"fibre": PhysicalFibre(), "solver": Direct(newton_steps=2)}
     for number, experiment in enumerate(listed):
         where = f"experiment {number + 1}"
         if not isinstance(experiment, dict):
             raise ValueError(f"{where}: it is {check.short(experiment)}; it must be a table")
         _check_keys(experiment, EXPERIMENT_KEYS, where)
-        label, weight = experiment.get("name", ""), experiment.get("weight", False)
+        label = experiment.get("name", "")
         check.text(f"{where}: name", label)
-        check.flag(f"{where}: weight", weight)
+        seen = Seen.of(experiment, where)
         if "/" in label or label in scenes:
             wanted = "it must have no '/', and differ from others"
             raise ValueError(f"{where}: name is {label!r}; {wanted}")
@@ -135,12 +201,12 @@ def _measured(table: dict[str, Any], name: str) -> Measured:
         if not isinstance(own, list) or not own:
             raise ValueError(f"{where}: it must have one or more [[experiment.state]]")
         changed = {**hair, **{key: experiment[key] for key in HAIR_KEYS if key in experiment}}
-        scenes[label], targets[label] = _experiment(changed, own, f"{where}, ", weight=weight)
+        scenes[label], targets[label] = _experiment(changed, own, f"{where}, ", seen, model)
     return Measured(title, scenes, targets)
 
 
 def _experiment(
-    hair: dict[str, Any], states: list[Any], where: str, *, weight: bool
+    hair: dict[str, Any], states: list[Any], where: str, seen: Seen, model: dict[str, Any]
 ) -> tuple[Scene, dict[str, Target]]:
     """The scene of an experiment, all states one after the other, and its targets."""
     rod = _number(hair, "rod_diameter", f"{where}hair")
@@ -150,7 +216,7 @@ def _experiment(
     natural = 0.0  # as all curls here, by the inverse of its diameter [1/m]
     if "natural_curl_diameter" in hair:
         natural = 1 / _number(hair, "natural_curl_diameter", f"{where}hair")
-    rest = HANGING if weight else BRIEF
+    rest = HANGING if seen.weight else BRIEF
     phases: list[Phase] = []
     targets: dict[str, Target] = {}
     for number, state in enumerate(states):
@@ -159,11 +225,12 @@ def _experiment(
         if label in targets:
             raise ValueError(f"{at}: name is {label!r} again; names must differ")
         phases += treatments.wash(name=f"{label}, wash before", **rest) if number else ()
-        phases += made
+        phases += seen.phases(made)
         targets[label] = _target(state, rod, natural, at)
     equal = Bonds((0.25, 0.25, 0.25, 0.25))
     try:
-        return Scene(curly(length, points, natural), bonds=equal, phases=tuple(phases)), targets
+        strands = curly(length, points, natural)
+        return Scene(strands, bonds=equal, phases=tuple(phases), **model), targets
     except ValueError as error:
         raise ValueError(f"{where}hair: {error}") from error
 

@@ -2,11 +2,13 @@
 
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
 
 import fitting
 import jaxhair as jh
+from fitting import measures
 from fitting.measured import from_text
 from fitting.strands import curl_shape
 
@@ -214,3 +216,76 @@ def test_experiments_from_a_file() -> None:
 def test_wrong_experiments_are_refused(old: str, new: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         from_text(EXPERIMENTS.replace(old, new), name="two.toml")
+
+
+SEEN = """
+[hair]
+rod_diameter = 12e-3
+length = 0.1
+points = 17
+[[experiment]]
+name = "dry"
+[[experiment.state]]
+name = "acid set"
+treatment = "acid set"
+set = 0.5
+[[experiment]]
+name = "other"
+hydrogen_left = 0.4
+[[experiment.state]]
+name = "acid set"
+treatment = "acid set"
+set = 0.5
+"""
+
+
+def ends(text: str) -> dict[str, jh.State]:
+    """How the acid set of each experiment is seen."""
+    found = from_text(text, name="seen.toml")
+    assert isinstance(found.scene, dict)
+    return {name: jax.jit(jh.run)(scene)["acid set"] for name, scene in found.scene.items()}
+
+
+def test_damp_air_takes_back_the_hydrogen_bonds_part_of_a_set() -> None:
+    """D_rod / D = (x f_H + f_I) / (x f_H + f_I + f_S + f_P) with x of the hydrogen bonds left."""
+    seen = ends(SEEN)
+    for name, left in (("dry", 1.0), ("other", 0.4)):
+        diameter = float(measures.curl(seen[name].points).diameter[0])
+        assert 12e-3 / diameter == pytest.approx((left + 1) / (left + 3), rel=2e-3)
+
+
+def test_a_load_at_the_tip_draws_a_curl_out() -> None:
+    """A hair of 0.66 mg and a curl of B kappa^2 = 5 mg: loads of 1 mg and of 20 mg, when the hair
+    is looked at and not before. What a load does to a rod is in test_mechanics."""
+    masses = {"dry": 1e-6, "other": 20e-6}
+    text = SEEN.replace('name = "dry"', f'name = "dry"\nweight = true\ntip_mass = {masses["dry"]}')
+    text = text.replace("hydrogen_left = 0.4", f"weight = true\ntip_mass = {masses['other']}")
+    scenes = from_text(text, name="seen.toml").scene
+    assert isinstance(scenes, dict)
+    for name, mass in masses.items():
+        leaves = jh.named_leaves(scenes[name])
+        loads = [leaf for leaf in leaves if "TipForce" in leaf]
+        assert loads == ["phases.acid set.TipForce.force"]
+        np.testing.assert_allclose(leaves[loads[0]], (0, 0, -9.8 * mass), rtol=1e-6)
+        assert isinstance(scenes[name].fibre, jh.PhysicalFibre)
+        assert isinstance(scenes[name].solver, jh.Direct)
+    drawn = {name: float(measures.extent(end.points)[0]) / 0.1 for name, end in ends(text).items()}
+    assert drawn["dry"] < 0.85
+    assert 0.93 < drawn["other"] < 1
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        ("hydrogen_left = 1.2", ["experiment 2", "hydrogen_left", "1.2", "[0, 1]"]),
+        ('hydrogen_left = "60 %"', ["experiment 2", "hydrogen_left", "'60 %'"]),
+        ("weight = true\ntip_mass = 0", ["experiment 2", "tip_mass", "0", "above 0"]),
+        ("tip_mass = 1e-5", ["experiment 2", "tip_mass", "1e-05", "weight is not true"]),
+        ("humidity = 0.4", ["experiment 2", "'humidity'", "hydrogen_left", "unknown"]),
+    ],
+)
+def test_wrong_circumstances_are_refused(new: str, words: list[str]) -> None:
+    with pytest.raises(ValueError) as error:
+        from_text(SEEN.replace("hydrogen_left = 0.4", new), name="seen.toml")
+    for word in words:
+        assert word in str(error.value)
