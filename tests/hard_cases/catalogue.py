@@ -87,7 +87,8 @@ class Case:
         slopes: steps over which derivatives are taken.
         modes: largest difference between forward and reverse mode in float32, relative to the
             terms that are summed; 1e-5 of it in float64.
-        except_for: what a solver does not keep, and why; the other bounds still hold.
+        except_for: what a solver, or "solver-precision", does not keep, and why; the other bounds
+            still hold.
         check: whatever else must hold of the last state.
     """
 
@@ -108,7 +109,7 @@ class Case:
     def __post_init__(self) -> None:
         known = {"why", *(f.name for f in fields(self))} - {"build", "except_for"}
         for solver, own in self.except_for.items():
-            assert solver in SOLVERS
+            assert solver.split("-")[0] in SOLVERS
             assert own.keys() <= known
             assert "why" in own, "no exception without a reason"
 
@@ -121,8 +122,9 @@ class Case:
         return built if isinstance(built, Start) else Start(built, start(built.as_arrays()))
 
     def within(self, setting: Setting) -> "Case":
-        """The case with the bounds of one solver."""
-        own = {k: v for k, v in self.except_for.get(setting.solver, {}).items() if k != "why"}
+        """The case with the bounds of one solver, in one precision."""
+        names = setting.solver, f"{setting.solver}-{setting.dtype}"
+        own = {k: v for n in names for k, v in self.except_for.get(n, {}).items() if k != "why"}
         return replace(self, **own)
 
 

@@ -10,6 +10,15 @@ from hard_cases.catalogue import HANGING, Setting, Start, among, hard, moved, st
 
 BEGINS = "contact begins and ends in kinks"
 
+PUSHED_OUT = {
+    "direct-float32": {
+        "slopes": 2,
+        "why": "pushed out at up to 200 m/s, slopes grow a thousandfold in two steps, and rounding "
+        "with them: over 8 steps forward and reverse mode part by 0.01 % to 12 %, in float64 by "
+        "1e-11",
+    }
+}
+
 
 def pair(first: Any, second: Any) -> jh.Strands:
     """Two straight strands, each from a root in a direction."""
@@ -83,6 +92,7 @@ def from_ball(x: np.ndarray) -> Any:
     speed=100,
     end_speed=0.5,
     stretch=0.5,
+    except_for=PUSHED_OUT,
 )
 def ball_centred_on_a_point(s: Setting) -> jh.Scene:
     return s.scene(straight(), *among(ball=(BALL, 0.05)))
@@ -98,7 +108,13 @@ def rod_along_the_hair(s: Setting) -> jh.Scene:
     return s.scene(straight(), *among(rod=((0, 0, -0.65), (0, 0, 1.0), 0.02)))
 
 
-@hard(breaks="all of the hair starts inside a ball", smooth=BEGINS, speed=200, stretch=3.0)
+@hard(
+    breaks="all of the hair starts inside a ball",
+    smooth=BEGINS,
+    speed=200,
+    stretch=3.0,
+    except_for=PUSHED_OUT,
+)
 def hair_inside_a_ball(s: Setting) -> jh.Scene:
     return s.scene(straight(), *among(ball=((0.03, 0.0, -0.12), 0.3)))
 
