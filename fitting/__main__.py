@@ -8,6 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fitting.constraints import Constraint, Positive, Simplex
 from fitting.fit import fit
 from fitting.measured import Measured, packaged, read
@@ -133,13 +135,24 @@ def _fit(options: argparse.Namespace) -> int:
         print(f"Fitting: {measured.title}. The first simulation includes compilation.")
 
     began = time.monotonic()
+    told: list[float] = []
 
-    def progress(simulations: int, misfit: float) -> None:
+    def progress(simulations: int, misfit: float, values: dict[str, np.ndarray]) -> None:
         spent = time.monotonic() - began
-        most = spent / simulations * (options.steps - simulations)
+        told.append(spent)
+        left = ""
+        # other starts, and the line searches of L-BFGS, take simulations beyond the steps
+        if 1 < simulations < options.steps and options.method != "l-bfgs":
+            each = (spent - told[0]) / (simulations - 1)  # without compilation
+            most = each * (options.steps - simulations)
+            left = f", at most {most:.0f} s left"
+        shown = "; ".join(
+            f"{name} {' '.join(f'{x:.4g}' for x in np.ravel(value))}"
+            for name, value in values.items()
+        )
         print(
-            f"  simulation {simulations:3d}: misfit {misfit:.4g} standard errors, {spent:.0f} s, "
-            f"at most {most:.0f} s left",
+            f"  simulation {simulations:3d}: misfit {misfit:.4g} standard errors, {spent:.0f} s"
+            f"{left}\n    {shown}",
             flush=True,
         )
 

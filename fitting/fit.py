@@ -15,8 +15,8 @@ from fitting.determined import Direction, undetermined
 from fitting.optimisers import (
     LOSSES,
     METHODS,
+    FitProgress,
     Optimum,
-    Progress,
     gradient_descent,
     rms,
 )
@@ -85,7 +85,7 @@ class Fit:
             raise ValueError(f"the fit has {len(self.scenes)} scenes; take one from .scenes")
         return next(iter(self.scenes.values()))
 
-    def again(self, targets: Mapping[str, Any], *, progress: Progress | None = None) -> "Fit":
+    def again(self, targets: Mapping[str, Any], *, progress: FitProgress | None = None) -> "Fit":
         """The same fit, of other observations of the same states, without compiling it again.
 
         Arguments: those of `fit`. Raises ValueError for targets of other states or kinds, and for
@@ -121,7 +121,7 @@ def fit(
     start_width: float = 1.0,
     seed: int = 0,
     level: float = 0.95,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> Fit:
     """The numbers of scenes with which hair does what was observed.
@@ -152,7 +152,8 @@ def fit(
             wrongly, a turn off, where the misfit is least nearby only.
         start_width: standard deviation of these in free numbers. seed: of their random numbers.
         level: of the intervals.
-        progress: called with the number of simulations so far and the misfit in standard errors.
+        progress: called with the number of simulations so far, the misfit in standard errors and
+            the values, as in `Fit.values`.
         checkpoint: a folder in which the work is kept as it goes on. The same fit goes on from
             there, however it ended, to the same result bit for bit (on the same kind of machine).
             One process at a time may use it.
@@ -218,7 +219,7 @@ def fit(
     return _result(problem, [found], time.perf_counter() - begin, settings)
 
 
-def _solved(problem: Problem, settings: dict[str, Any], progress: Progress | None) -> Fit:
+def _solved(problem: Problem, settings: dict[str, Any], progress: FitProgress | None) -> Fit:
     """By least squares from all starts."""
     begin = time.perf_counter()
     found = from_all_starts(problem, settings, progress)
@@ -295,7 +296,7 @@ def _result(
         squares.append(off.ravel())
     all_mm = MM * np.sqrt(3) * rms(np.concatenate(squares)) if squares else np.nan
     return Fit(
-        values={name: np.asarray(v) for name, v in parameters.values(free).items()},
+        values=parameters.arrays(free),
         uncertainty=spread,
         residual_mm=float(all_mm),
         residuals_mm={name: float(value) for name, value in residuals_mm.items()},

@@ -15,6 +15,7 @@ from fitting.problem import Problem
 from jaxhair.checkpoints import Checkpoints, named, unnamed
 
 Progress = Callable[[int, float], None]
+FitProgress = Callable[[int, float, dict[str, np.ndarray]], None]
 
 METHODS = ("levenberg-marquardt", "adam", "l-bfgs")
 LOSSES = ("linear", "soft_l1", "huber", "cauchy")
@@ -52,7 +53,7 @@ def least_squares_from(
     steps: int,
     tolerance: float,
     loss: str = "linear",
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
     extra: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Optimum:
     """SciPy's least squares, in float64 around a simulation of any precision.
@@ -66,8 +67,8 @@ def least_squares_from(
 
     Arguments:
         loss: of a residual; "linear" is its square.
-        progress: called with the number of simulations so far and the data's root mean square
-            residual in standard errors.
+        progress: called with the number of simulations so far, the data's root mean square
+            residual in standard errors, and the values.
         extra: more residuals and their Jacobian.
     """
     taken, last, broken = 0, b"", False
@@ -78,7 +79,8 @@ def least_squares_from(
         if free.tobytes() != last:  # SciPy asks twice for the start, and again for the Jacobian
             taken, last = taken + 1, free.tobytes()
             if progress is not None:
-                progress(taken, rms(residuals[: problem.size]))
+                misfit = rms(residuals[: problem.size])
+                progress(taken, misfit, problem.parameters.arrays(free))
         broken = broken or not (np.isfinite(residuals).all() and np.isfinite(jacobian).all())
         residuals = np.where(np.isfinite(residuals), residuals, 1e6)
         if extra is not None:
@@ -111,7 +113,7 @@ def gradient_descent(
     steps: int,
     tolerance: float,
     learning_rate: float,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
     journal: Checkpoints | None = None,
 ) -> Optimum:
     """Adam or L-BFGS on the mean square, until it falls no more by the relative tolerance.
@@ -164,7 +166,7 @@ def gradient_descent(
         new, memory, value, simulated = update(free, memory)
         loss_now, taken = float(value), taken + sum(int(number) for number in simulated)
         if progress is not None:
-            progress(taken, float(np.sqrt(loss_now)))
+            progress(taken, float(np.sqrt(loss_now)), problem.parameters.arrays(free))
         if not np.isfinite(loss_now):
             return ended(best, False, "values were not finite")
         if loss_now < least[-1]:

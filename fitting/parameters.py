@@ -129,6 +129,11 @@ class Parameters:
             begin += p.size
         return values
 
+    def arrays(self, free: Any) -> dict[str, np.ndarray]:
+        """`values`, outside of a program."""
+        values = self.values(jnp.asarray(free, self.dtype))
+        return {name: np.asarray(value) for name, value in values.items()}
+
     def apply(self, free: Array) -> dict[str, Scene]:
         """The scenes with the values for free numbers of shape (n,), by experiment; one scene
         alone has the name ""."""

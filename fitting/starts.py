@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from fitting.optimisers import Optimum, Progress, least_squares_from, rms
+from fitting.optimisers import FitProgress, Optimum, least_squares_from, rms
 from fitting.problem import Problem
 
 GOOD = 2.0
@@ -30,7 +29,7 @@ class Basin:
 
 
 def from_all_starts(
-    problem: Problem, settings: dict[str, Any], progress: Progress | None
+    problem: Problem, settings: dict[str, Any], progress: FitProgress | None
 ) -> list[Optimum]:
     """Optima from the given start and from others about it, the best first."""
     options = {name: settings[name] for name in ("steps", "tolerance", "loss")}
@@ -39,9 +38,9 @@ def from_all_starts(
     found: list[Optimum] = []
     taken = 0
 
-    def told(number: int, misfit: float) -> None:
+    def told(number: int, misfit: float, values: dict[str, np.ndarray]) -> None:
         if progress is not None:
-            progress(taken + number, misfit)
+            progress(taken + number, misfit, values)
 
     for number in range(settings["starts"] + settings["retries"]):
         good = found and np.sqrt(2 * min(o.cost for o in found) / problem.size) < GOOD
@@ -71,12 +70,6 @@ def basins(problem: Problem, found: list[Optimum], covariance: np.ndarray) -> tu
     found_basins = []
     for group in groups:
         residuals, _, _ = problem.evaluate(group[0].free)
-        at = problem.parameters.values(jnp.asarray(group[0].free, problem.start.dtype))
-        found_basins.append(
-            Basin(
-                {name: np.asarray(value) for name, value in at.items()},
-                rms(residuals[: problem.size]),
-                len(group),
-            )
-        )
+        at = problem.parameters.arrays(group[0].free)
+        found_basins.append(Basin(at, rms(residuals[: problem.size]), len(group)))
     return tuple(found_basins)

@@ -242,7 +242,7 @@ def stopped_and_finished(tmp_path: Path, method: str) -> None:
     whole = tiny_fit(None, method)
     calls: list[int] = []
 
-    def stop(step: int, residual: float) -> None:
+    def stop(step: int, *_: Any) -> None:
         calls.append(step)
         if len(calls) in (2, 5):
             raise KeyboardInterrupt

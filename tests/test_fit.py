@@ -133,7 +133,7 @@ def test_all_simulations_are_counted(method: str, later: int) -> None:
             method=method,
             steps=4,
             retries=0,
-            progress=lambda simulations, misfit: told.append(simulations),
+            progress=lambda simulations, *_: told.append(simulations),
         )
     jax.effects_barrier()
     assert len(COMPARED) == found.steps + later
@@ -178,15 +178,17 @@ def test_progress_is_told_of_every_simulation() -> None:
     scene = jh.Scene(
         hair, phases=treatments.water_set(rod_diameter=30e-3, seconds=0.02, free=(jh.Hold(),))
     )
-    told: list[tuple[int, float]] = []
+    told: list[tuple[int, float, dict[str, np.ndarray]]] = []
     found = fitting.fit(
         scene,
         {"water set": fitting.helix(diameter=80e-3)},
         {"bonds.influence": fitting.Simplex()},
-        progress=lambda step, residual: told.append((step, residual)),
+        progress=lambda *now: told.append(now),
     )
-    assert [step for step, _ in told] == list(range(1, found.steps + 1))
+    assert [step for step, *_ in told] == list(range(1, found.steps + 1))
     assert told[-1][1] < told[0][1]
+    np.testing.assert_allclose(told[0][2]["bonds.influence"], scene.bonds.influence, rtol=1e-6)
+    np.testing.assert_allclose(told[-1][2]["bonds.influence"], found.values["bonds.influence"])
 
 
 @pytest.mark.parametrize(
