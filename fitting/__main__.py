@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fitting.command_line import STRAND_UNITS, add_strand_files, add_work, status
 from fitting.constraints import Constraint, Positive, Simplex
 from fitting.fit import fit
 from fitting.measured import Measured, packaged, read
@@ -17,7 +18,7 @@ from fitting.optimisers import METHODS
 from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
 from jaxhair import read_curves
-from jaxhair.__main__ import UNITS, length, parsed
+from jaxhair.__main__ import length, parsed
 
 FREE: dict[str, Constraint] = {"bonds.influence": Simplex(), "fibre.peeling_rate": Positive()}
 
@@ -48,22 +49,14 @@ def parser() -> argparse.ArgumentParser:
         help="strands (.hair, .data, .npz), each as FILE or STATE=FILE with a STATE of "
         f"{', '.join(STATES)} (in this order if not named); or one .toml of measured curls",
     )
-    top.add_argument("--unit", default="m", choices=(*UNITS, "inch"), help="of strand files (m)")
-    top.add_argument("--up", default="z", choices=("y", "z"), help="axis of strand files (z)")
+    add_strand_files(top)
     top.add_argument("--rod-diameter", type=length, help="such as 17mm (0.6 of the curls')")
     top.add_argument("--strands", type=int, default=16, help="how many to use at most (16)")
     top.add_argument("--points", type=int, help="points on a simulated strand")
     top.add_argument("--weight", action="store_true", help="the target hangs under gravity")
     top.add_argument("--method", choices=METHODS, default=METHODS[0], help=f"({METHODS[0]})")
     top.add_argument("--steps", type=int, default=50, help="largest number of simulations (50)")
-    top.add_argument("--overwrite", action="store_true", help="replace files in DIR")
-    top.add_argument(
-        "--checkpoint",
-        metavar="DIR",
-        help="keep the work in this folder as it goes on: however it is interrupted, the same "
-        "command goes on from there, to the same result. Delete it when all is done",
-    )
-    top.add_argument("--quiet", action="store_true", help="show no progress")
+    add_work(top)
     return top
 
 
@@ -73,16 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in COMMANDS:
         return import_module(COMMANDS[given[0]]).main(given[1:])
-    options = parsed(parser(), given)
-    try:
-        return _fit(options)
-    except KeyboardInterrupt:
-        kept = f"; the same command goes on from {options.checkpoint}"
-        print(f"interrupted{kept if options.checkpoint else ''}", file=sys.stderr)
-        return 130
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return status(_fit, parsed(parser(), given))
 
 
 def _measured(options: argparse.Namespace) -> Measured:
@@ -91,7 +75,7 @@ def _measured(options: argparse.Namespace) -> Measured:
         return packaged()
     if len(options.target) == 1 and options.target[0].endswith(".toml"):
         return read(options.target[0])
-    unit = {**UNITS, "inch": 0.0254}[options.unit]
+    unit = STRAND_UNITS[options.unit]
     observed: dict[str, Any] = {}
     unnamed = iter(STATES)
     for text in options.target:

@@ -10,12 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fitting.command_line import STRAND_UNITS, add_strand_files, add_work, status
 from fitting.many import SHARES, FitEach, fit_each, quantiles
 from fitting.measures import curl
 from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
 from fitting.report import plain, versions
 from jaxhair import BONDS, Curves, check, read_strands, write_curves
-from jaxhair.__main__ import UNITS, parsed
+from jaxhair.__main__ import parsed
 from jaxhair.export import check_new
 from jaxhair.output import new_file
 
@@ -39,38 +40,21 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("file", metavar="FILE", help="strands as they hang: .hair, .data or .npz")
     top.add_argument("--unloaded", metavar="FILE", help="the same strands without weight")
-    top.add_argument("--unit", default="m", choices=(*UNITS, "inch"), help="of strand files (m)")
-    top.add_argument("--up", default="z", choices=("y", "z"), help="axis of strand files (z)")
+    add_strand_files(top)
     top.add_argument("--strands", type=int, help="how many to use at most, spread evenly (all)")
     top.add_argument("--points", type=int, help="points on a simulated strand (17 to 65)")
     top.add_argument(
         "--no-weight", action="store_true", help="FILE shows strands without weight, as modelled"
     )
     top.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
-    top.add_argument("--overwrite", action="store_true", help="replace files in DIR")
-    top.add_argument(
-        "--checkpoint",
-        metavar="DIR",
-        help="keep the work in this folder as it goes on: however it is interrupted, the same "
-        "command goes on from there, to the same result. Delete it when all is done",
-    )
-    top.add_argument("--quiet", action="store_true", help="show no progress")
+    add_work(top)
     return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fits, prints and writes; returns 0, or 2 after a mistake in the request, or 130 after
     Ctrl-C."""
-    options = parsed(parser(), arguments)
-    try:
-        return _natural(options)
-    except KeyboardInterrupt:
-        kept = f"; the same command goes on from {options.checkpoint}"
-        print(f"interrupted{kept if options.checkpoint else ''}", file=sys.stderr)
-        return 130
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return status(_natural, parsed(parser(), arguments))
 
 
 def _natural(options: argparse.Namespace) -> int:
@@ -79,7 +63,7 @@ def _natural(options: argparse.Namespace) -> int:
             check.whole(f"--{name}", getattr(options, name), least=least)
     if options.unloaded is not None and options.no_weight:
         raise ValueError("--no-weight is for strands of one file; leave out it or --unloaded")
-    unit = {**UNITS, "inch": 0.0254}[options.unit]
+    unit = STRAND_UNITS[options.unit]
     files = [options.file] + ([] if options.unloaded is None else [options.unloaded])
     seen = [read_strands(path, unit=unit, up=options.up) for path in files]
     folder = Path(options.output)
