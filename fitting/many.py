@@ -88,11 +88,16 @@ class FitEach:
 
     def __str__(self) -> str:
         lines = [f"{self.fitted.sum()} of {len(self.reasons)} strands fitted", *self.summary()]
-        left = [(i, reason) for i, reason in enumerate(self.reasons) if reason is not None]
-        lines += [f"strand {i}: {reason}" for i, reason in left[:10]]
-        if len(left) > 10:
-            lines.append(f"and {len(left) - 10} more could not be fitted")
-        return "\n".join(lines)
+        left = {i: reason for i, reason in enumerate(self.reasons) if reason is not None}
+        return "\n".join([*lines, *not_fitted(left)])
+
+
+def not_fitted(reasons: Mapping[int, str], most: int = 10) -> list[str]:
+    """Lines on strands that could not be fitted, from a strand's number to the reason."""
+    lines = [f"strand {i}: {reason}" for i, reason in list(reasons.items())[:most]]
+    if len(reasons) > most:
+        lines.append(f"and {len(reasons) - most} more could not be fitted")
+    return lines
 
 
 def quantiles(values: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from jaxhair import (
     Cut,
     Direct,
     Drag,
+    Gravity,
     Hold,
     Phase,
     PhysicalFibre,
@@ -49,9 +50,6 @@ TREATMENTS: dict[Any, Callable[..., tuple[Phase, ...]]] = {
     "perm": treatments.perm,
 }
 HANGING: dict[str, Any] = {"seconds": 1.0, "free": treatments.HANGING}
-
-G = 9.80
-"""That of `Gravity` [m/s^2]."""
 
 FILE_KEYS = {"title", "hair", "state", "experiment"}
 HAIR_KEYS = {"natural_curl_diameter", "rod_diameter", "length", "points"}
@@ -110,7 +108,7 @@ class Seen:
             effects = (Unloaded(), Cut(hydrogen=self.hydrogen_left))
             damp = [Phase(f"{last.name}, damp", treatments.AT_ONCE, effects)]
         if self.tip_mass is not None:
-            load = TipForce((0.0, 0.0, -G * self.tip_mass))
+            load = TipForce(self.tip_mass * np.asarray(Gravity().acceleration))
             last = replace(last, effects=(*last.effects, load))
         return [*made[:-1], *damp, last]
 

@@ -31,7 +31,7 @@ import numpy as np
 from fitting.constraints import Constraint, Positive, Scale, Share
 from fitting.ends import in_tiles
 from fitting.hanging import STIFFER, Counted, held_up, take, times
-from fitting.many import FitEach, distribution
+from fitting.many import FitEach, distribution, not_fitted
 from fitting.polylines import cleaned, evenly, listed, turns
 from fitting.targets import MM, Shape, Target
 from jaxhair import (
@@ -124,10 +124,7 @@ class Natural:
         )
         counts = [f"{(self.stiffer == x).sum()} of {x:g}" for x in np.unique(self.stiffer)]
         lines.append(f"strands by their stiffness over a single hair's: {', '.join(counts)}")
-        lines += [f"strand {i}: {reason}" for i, reason in list(reasons.items())[:most]]
-        if len(reasons) > most:
-            lines.append(f"and {len(reasons) - most} more could not be fitted")
-        return "\n".join(lines)
+        return "\n".join([*lines, *not_fitted(reasons, most)])
 
 
 def natural(

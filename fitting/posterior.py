@@ -193,12 +193,11 @@ def posterior(
 def _log_density(found: Fit, free: Callable[[Array], Array]) -> Callable[[Array], Array]:
     """-chi^2 / 2 of a place, shape (n,), with its gradient by the mode that the fit took."""
     problem = found.problem
-    weights = np.ones(problem.size) / max(1.0, found.uncertainty.scatter)
+    weight = 1 / max(1.0, found.uncertainty.scatter)
 
     def residuals(place: Array) -> Array:
         each = problem.residuals(free(place), problem.states)[0]
-        data = each[: problem.size] * jnp.asarray(weights, each.dtype)
-        return jnp.concatenate([data, each[problem.size :]])
+        return jnp.concatenate([weight * each[: problem.size], each[problem.size :]])
 
     def value(place: Array) -> Array:
         return -jnp.sum(residuals(place) ** 2) / 2
