@@ -1,4 +1,4 @@
-"""The command line: `python -m jaxhair simulate perm --output perm.png`, and `accuracy`."""
+"""The command line: `python -m jaxhair simulate perm --output perm.png`, `accuracy`, `cost`."""
 
 import argparse
 import sys
@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxhair import check, scenes
 from jaxhair.accuracy import command as accuracy
+from jaxhair.cost import command as cost
 from jaxhair.direct import Direct
 from jaxhair.export import check_drawing, check_ending, check_new, save
 from jaxhair.recording import NotFinite, simulate
@@ -29,33 +30,10 @@ def parser() -> argparse.ArgumentParser:
         ".data), a picture of it (.png) or a movie (.gif, .mp4).",
         epilog="example: python -m jaxhair simulate perm --rod-diameter 60mm --output perm.gif",
     )
-    run.add_argument("scene", choices=tuple(scenes.SCENES), help="which scene")
+    _add_scene(run)
     run.add_argument("--output", required=True, metavar="FILE", help="file to write")
     run.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
-    run.add_argument("--strands", type=int, help="number of strands (as in the paper)")
-    run.add_argument("--points", type=int, help="points on a strand (as in the paper)")
-    run.add_argument("--length", type=length, help="of a strand, such as 24cm (as in the paper)")
-    run.add_argument("--rod-diameter", type=length, help="perm only, such as 60mm (60mm)")
-    run.add_argument(
-        "--prepared", action="store_true", help="perm only: start wound, skip the winding"
-    )
-    run.add_argument("--no-contact", action="store_true", help="hairs pass through each other")
-    run.add_argument("--wash", action="store_true", help="wash the hair at the end")
-    run.add_argument(
-        "--solver",
-        choices=SOLVERS,
-        default="paper",
-        help="the paper's, with its k; or, with stiffnesses in pascal, compliant constraints "
-        "(XPBD) or the direct solver (paper)",
-    )
-    run.add_argument("--iterations", type=int, help="of paper or compliant in a step (5)")
-    run.add_argument("--sweep", choices=SWEEPS, help="order, of the same (red-black)")
-    run.add_argument("--newton-steps", type=int, help="of direct in a step (1)")
-    run.add_argument("--substeps", type=int, default=1, help="solves in a step (1)")
-    run.add_argument("--steps-per-second", type=float, default=360, help="time steps (360)")
-    run.add_argument("--seconds", type=float, help="stop after this simulated time")
     run.add_argument("--fps", type=float, default=30.0, help="frames a second (30)")
-    run.add_argument("--seed", type=int, default=0, help="of the roots' places (0)")
     run.add_argument("--color-by", choices=BONDS, help="show a bonded fraction, blue 0 to red 1")
     run.add_argument("--size", type=int, default=800, help="of pictures, pixels (800)")
     run.add_argument(
@@ -66,7 +44,36 @@ def parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--quiet", action="store_true", help="show no progress")
     accuracy.add_command(commands)
+    _add_scene(cost.add_command(commands))
     return top
+
+
+def _add_scene(parser: argparse.ArgumentParser) -> None:
+    """Add the scene and its options, which `_scene` makes a scene of."""
+    parser.add_argument("scene", choices=tuple(scenes.SCENES), help="which scene")
+    parser.add_argument("--strands", type=int, help="number of strands (as in the paper)")
+    parser.add_argument("--points", type=int, help="points on a strand (as in the paper)")
+    parser.add_argument("--length", type=length, help="of a strand, such as 24cm (as in the paper)")
+    parser.add_argument("--rod-diameter", type=length, help="perm only, such as 60mm (60mm)")
+    parser.add_argument(
+        "--prepared", action="store_true", help="perm only: start wound, skip the winding"
+    )
+    parser.add_argument("--no-contact", action="store_true", help="hairs pass through each other")
+    parser.add_argument("--wash", action="store_true", help="wash the hair at the end")
+    parser.add_argument(
+        "--solver",
+        choices=SOLVERS,
+        default="paper",
+        help="the paper's, with its k; or, with stiffnesses in pascal, compliant constraints "
+        "(XPBD) or the direct solver (paper)",
+    )
+    parser.add_argument("--iterations", type=int, help="of paper or compliant in a step (5)")
+    parser.add_argument("--sweep", choices=SWEEPS, help="order, of the same (red-black)")
+    parser.add_argument("--newton-steps", type=int, help="of direct in a step (1)")
+    parser.add_argument("--substeps", type=int, default=1, help="solves in a step (1)")
+    parser.add_argument("--steps-per-second", type=float, default=360, help="time steps (360)")
+    parser.add_argument("--seconds", type=float, help="stop after this simulated time")
+    parser.add_argument("--seed", type=int, default=0, help="of the roots' places (0)")
 
 
 SOLVERS: dict[str, type[Any]] = {
@@ -105,7 +112,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns 0, or 2 after a mistake in what was asked, or 1 if it failed."""
     options = parsed(parser(), arguments)
     try:
-        return accuracy.run(options) if options.command == "accuracy" else _simulate(options)
+        if options.command == "accuracy":
+            return accuracy.run(options)
+        if options.command == "cost":
+            return cost.run(options, _scene(options))
+        return _simulate(options)
     except (ValueError, OSError, ImportError, NotFinite) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, NotFinite) else 2

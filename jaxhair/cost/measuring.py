@@ -1,0 +1,282 @@
+"""Time, operations and memory of a scene's step, and what each part adds to them."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxhair import check
+from jaxhair.cost.parts import Plan, Variant, plan
+from jaxhair.scene import Phase, Scene
+from jaxhair.simulate import phase_end, start
+from jaxhair.strands import State
+
+BAR = 0.15
+"""Within this part of it, the parts must add up to the measured whole."""
+
+ENOUGH = 2.0
+"""Seconds after which a program has been timed enough."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What something takes, or adds to what the rest takes; a difference can be below 0.
+
+    Arguments:
+        name: such as "HairContact".
+        seconds: wall time of one step [s].
+        operations: on floating-point numbers in one step, as traced; NaN where nothing counts them.
+        memory: temporaries of the program [bytes]; None where the compiler does not say.
+        compile_seconds: of the program, tracing included; measured once.
+    """
+
+    name: str
+    seconds: float
+    operations: float
+    memory: int | None
+    compile_seconds: float
+
+
+@dataclass(frozen=True)
+class PhaseCost:
+    """Cost of a step in phases that have the same kinds of effects; the first was measured.
+
+    Arguments:
+        phases: their names. steps: of all of them.
+        whole: the step. parts: what each part of it adds.
+        first: the effect that makes more than half of the operations, or "". It is left out from
+            the whole, and all others from the rest, in whose noise they do not drown.
+        rest: seconds of a step without the first.
+        noise: how much the rest's time differed when it was measured twice [s].
+        derivatives: of all the steps measured, over a step, in forward mode along one direction
+            and in reverse mode in all numbers of the scene; empty where they were not asked for.
+    """
+
+    phases: tuple[str, ...]
+    steps: int
+    whole: Part
+    parts: tuple[Part, ...]
+    first: str
+    rest: float
+    noise: float
+    derivatives: tuple[Part, ...] = ()
+
+    @property
+    def total_seconds(self) -> float:
+        """Sum over the parts [s]."""
+        return sum(part.seconds for part in self.parts)
+
+    @property
+    def total_operations(self) -> float:
+        """Sum over the parts."""
+        return sum(part.operations for part in self.parts)
+
+    @property
+    def share(self) -> float:
+        """The parts' sum of seconds over the measured whole."""
+        return self.total_seconds / self.whole.seconds
+
+    @property
+    def share_of_rest(self) -> float:
+        """The same without the first."""
+        first = sum(part.seconds for part in self.parts if part.name == self.first)
+        return (self.total_seconds - first) / self.rest
+
+    @property
+    def adds_up(self) -> bool:
+        """Both are within `BAR` of 1."""
+        return abs(self.share - 1) <= BAR and abs(self.share_of_rest - 1) <= BAR
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCost:
+    """Cost of a step in all phases of a scene.
+
+    Arguments:
+        scene: that was measured. phases: their costs.
+        measured_steps: in each timed call. repeat: most calls, of which the fastest counts.
+    """
+
+    scene: Scene
+    phases: tuple[PhaseCost, ...]
+    measured_steps: int
+    repeat: int
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the whole scene [s], without compilation."""
+        return sum(phase.whole.seconds * phase.steps for phase in self.phases)
+
+    @property
+    def times_real_time(self) -> float:
+        """Simulated time over wall time."""
+        return self.scene.duration / self.seconds
+
+    def __str__(self) -> str:
+        from jaxhair.cost.table import text
+
+        return text(self)
+
+
+def measured(
+    scene: Scene,
+    *,
+    steps: int = 36,
+    repeat: int = 100,
+    gradients: bool = False,
+    progress: bool = False,
+) -> SceneCost:
+    """Time, operations and memory of a step of each phase, and what each part adds to them.
+
+    A part's cost is the step's with it less the step's without it. Each is a compiled loop of
+    steps; the loops of a phase take turns, and of each the fastest of several calls counts. All
+    start from the scene's first state: no operation of a step depends on where the hair is.
+
+    Arguments:
+        steps: of a loop.
+        repeat: how often each is called; one that has taken `ENOUGH` seconds and was called five
+            times is called no more.
+        gradients: measure derivatives of the whole too.
+        progress: show a progress bar on stderr.
+
+    Raises ValueError for a scene without phases.
+    """
+    check.instance("scene", scene, Scene)
+    check.whole("steps", steps, least=1, most=100_000)
+    check.whole("repeat", repeat, least=1)
+    check.flag("gradients", gradients)
+    check.flag("progress", progress)
+    if not scene.phases:
+        raise ValueError("scene.phases is (); it must have at least one phase")
+    numbers = scene.as_arrays()
+    state = start(numbers)
+    bare = replace(numbers, phases=())
+    bench = _Bench(state, steps, repeat, {})
+    costs = tuple(
+        _phase_cost(bench, bare, phases, gradients)
+        for phases in _shown(_alike(numbers.phases), progress)
+    )
+    return SceneCost(scene, costs, steps, repeat)
+
+
+def _alike(phases: Sequence[Phase]) -> list[list[Phase]]:
+    """Phases by the classes of their effects."""
+    groups: dict[tuple[type, ...], list[Phase]] = {}
+    for phase in phases:
+        groups.setdefault(tuple(type(e) for e in phase.effects), []).append(phase)
+    return list(groups.values())
+
+
+def _shown(groups: list[list[Phase]], progress: bool) -> Iterator[list[Phase]]:
+    if not progress:
+        yield from groups
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=len(groups), desc="measuring", unit="phase") as bar:
+        for phases in groups:
+            bar.set_postfix_str(phases[0].name)
+            yield phases
+            bar.update()
+
+
+@dataclass(frozen=True)
+class _Program:
+    """A compiled loop of steps."""
+
+    call: Callable[..., Any]
+    memory: int | None
+    compile_seconds: float
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """Where programs are compiled, once each, and timed.
+
+    Arguments:
+        state: before the first step. steps: of a loop. repeat: most calls of it.
+        programs: compiled so far, by the structure and shapes of their arguments.
+    """
+
+    state: State
+    steps: int
+    repeat: int
+    programs: dict[Any, _Program]
+
+    def program(self, variant: Variant) -> _Program:
+        leaves, tree = jax.tree.flatten((variant.scene, variant.effects))
+        key = tree, tuple(np.shape(leaf) for leaf in leaves)
+        if key not in self.programs:
+            self.programs[key] = self.compiled(phase_end.lower, variant, steps=self.steps)
+        return self.programs[key]
+
+    def compiled(self, lower: Callable[..., Any], variant: Variant, **options: int) -> _Program:
+        begin = time.perf_counter()
+        program = lower(variant.scene, variant.effects, self.state, **options).compile()
+        taken = time.perf_counter() - begin
+        analysis = program.memory_analysis()
+        memory = None if analysis is None else int(analysis.temp_size_in_bytes)
+        return _Program(program, memory, taken)
+
+    def seconds(self, calls: dict[str, tuple[_Program, Variant]]) -> dict[str, float]:
+        """Shortest time of a step of each program, but for the first call; they take turns."""
+        taken: dict[str, list[float]] = {name: [] for name in calls}
+        for _ in range(self.repeat + 1):
+            for name, (program, variant) in calls.items():
+                if len(taken[name]) > 5 and sum(taken[name]) > ENOUGH:
+                    continue
+                begin = time.perf_counter()
+                end = program.call(variant.scene, variant.effects, self.state)
+                jax.block_until_ready(end)  # type: ignore[no-untyped-call]
+                taken[name].append(time.perf_counter() - begin)
+        return {name: min(times[1:]) / self.steps for name, times in taken.items()}
+
+    def derivatives(self, variant: Variant) -> dict[str, tuple[_Program, Variant]]:
+        """Programs of the loop's derivatives, in forward and in reverse mode."""
+
+        def end(*arguments: Any) -> Any:
+            return phase_end(*arguments, steps=self.steps)
+
+        def forward(*arguments: Any) -> Any:
+            return jax.jvp(end, arguments, arguments)
+
+        def reverse(*arguments: Any) -> Any:
+            return jax.grad(lambda *x: end(*x).positions.mean(), argnums=(0, 1))(*arguments)
+
+        return {
+            name: (self.compiled(jax.jit(function).lower, variant), variant)
+            for name, function in (("forward mode", forward), ("reverse mode", reverse))
+        }
+
+
+def _phase_cost(bench: _Bench, scene: Scene, phases: Sequence[Phase], gradients: bool) -> PhaseCost:
+    made: Plan = plan(scene, phases[0].effects, bench.state)
+    calls = {name: (bench.program(variant), variant) for name, variant in made.variants.items()}
+    derivatives = bench.derivatives(made.variants["whole"]) if gradients else {}
+    again = "rest, measured again"
+    taken = bench.seconds(calls | {again: calls["rest"]} | derivatives)
+
+    def part(name: str, with_it: str, without: str = "") -> Part:
+        program = (calls | derivatives)[with_it][0]
+        operations = made.operations.get(name, float("nan"))
+        seconds, memory, compiled = taken[with_it], program.memory, program.compile_seconds
+        if without:
+            other = calls[without][0]
+            seconds, compiled = seconds - taken[without], compiled - other.compile_seconds
+            known = memory is not None and other.memory is not None
+            memory = memory - other.memory if known else None  # type: ignore[operator]
+        return Part(name, seconds, operations, memory, compiled)
+
+    return PhaseCost(
+        phases=tuple(phase.name for phase in phases),
+        steps=sum(phase.steps(scene.dt) for phase in phases),
+        whole=part("whole", "whole"),
+        parts=tuple(part(name, *pair) for name, pair in made.parts.items()),
+        first=made.first,
+        rest=taken["rest"],
+        noise=abs(taken["rest"] - taken[again]),
+        derivatives=tuple(part(name, name) for name in derivatives),
+    )
