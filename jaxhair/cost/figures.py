@@ -6,12 +6,12 @@ from typing import Any
 from jaxhair.cost import table
 from jaxhair.cost.measuring import Part, PhaseCost, SceneCost
 from jaxhair.cost.parts import ELASTICITY, ITSELF, REST_SHAPE
-from jaxhair.figures import figure
+from jaxhair.figures import figure, optional
 from jaxhair.output import new_file
 
-STEP_COLOR, EFFECT_COLOR, SHARED_COLOR = "#9aa5b1", "#1f6f8b", "#dd9b30"
-CUT = 1.3
-"""A bar ends at this many times the longest of the others."""
+COLORS = {"effect": "#1f6f8b", "step without effects": "#9aa5b1", "shared or rounding": "#dd9b30"}
+CUT, FAR_LONGER = 1.25, 5.0
+"""A bar that is far longer than all others ends at `CUT` times the longest of them."""
 
 
 def bars(
@@ -37,16 +37,20 @@ def bars(
         parts = (*phase.parts, table.shared(phase))
         noise = 1e6 * phase.noise
         times.axvspan(-noise, noise, color="0.9", zorder=0)
-        _panel(times, parts, [1e6 * part.seconds for part in parts], "us")
-        _panel(counts, parts, [part.operations / 1e3 for part in parts], "thousand")
+        _panel(times, parts, [1e6 * part.seconds for part in parts])
+        _panel(counts, parts, [part.operations / 1e3 for part in parts])
         counts.set_yticklabels([])
         names = ", ".join(phase.phases)
         times.set_title(f"{names}: {_whole(phase)}", loc="left", fontsize=12)
         counts.set_title(
             f"{phase.whole.operations / 1e6:,.3g} million operations", loc="left", fontsize=12
         )
-    panels[-1][0].set_xlabel("time that a part adds to a step [us]; grey: noise", fontsize=11)
+    panels[-1][0].set_xlabel("time that a part adds to a step [us]; grey band: noise", fontsize=11)
     panels[-1][1].set_xlabel("floating-point operations [thousand]", fontsize=11)
+    boxes = [
+        optional("matplotlib.patches").Patch(color=c, label=what) for what, c in COLORS.items()
+    ]
+    drawing.legend(handles=boxes, loc="outside lower center", ncols=3, frameon=False, fontsize=11)
     with new_file(path, overwrite=overwrite) as temporary:
         drawing.savefig(temporary)
 
@@ -56,25 +60,24 @@ def _whole(phase: PhaseCost) -> str:
     return whole + (f", {1e6 * phase.rest:,.0f} without {phase.first}" if phase.first else "")
 
 
-def _panel(axes: Any, parts: tuple[Part, ...], values: list[float], unit: str) -> None:
+def _panel(axes: Any, parts: tuple[Part, ...], values: list[float]) -> None:
     """Horizontal bars with their numbers; one that is far longer than all others is cut off."""
-    longest = sorted(abs(value) for value in values)
-    end = CUT * longest[-2] if len(longest) > 1 else longest[-1]
-    end = max(end, 1e-9) if longest[-1] > 2 * end else max(longest[-1], 1e-9)
+    *_, second, longest = sorted(abs(value) for value in values)
+    end = max(CUT * second if longest > FAR_LONGER * second > 0 else longest, 1e-9)
     places = range(len(values))
     axes.barh(places, [min(v, end) for v in values], color=[_color(p) for p in parts], height=0.7)
     for place, value in zip(places, values, strict=True):
-        cut = value > end
-        at = max(0.0, min(value, end))
         number = f"{value:,.1f}" if abs(value) < 100 else f"{value:,.0f}"
-        axes.text(
-            at + 0.012 * end, place, f"» {number} {unit}" if cut else number, va="center",
-            fontsize=11, fontweight="bold" if cut else "normal",
-        )  # fmt: skip
+        at = max(0.0, min(value, end)) + 0.012 * end
+        cut = value > end
+        axes.text(at, place, number, va="center", fontsize=11, weight="bold" if cut else "normal")
+        for gap in (0.9, 0.93) if cut else ():
+            ends = [(gap - 0.01) * end, (gap + 0.01) * end]
+            axes.plot(ends, [place + 0.45, place - 0.45], color="white", linewidth=3)
     axes.axvline(0, color="0.3", linewidth=1)
     axes.set_yticks(places, [part.name for part in parts], fontsize=11)
     axes.set_ylim(len(values) - 0.4, -0.6)
-    axes.set_xlim(min(0.0, *values) - 0.03 * end, 1.28 * end)
+    axes.set_xlim(min(0.0, *values) - 0.03 * end, 1.16 * end)
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)
     for side in ("top", "right", "left"):
@@ -84,5 +87,5 @@ def _panel(axes: Any, parts: tuple[Part, ...], values: list[float], unit: str) -
 
 def _color(part: Part) -> str:
     if part.name in (ITSELF, REST_SHAPE, ELASTICITY):
-        return STEP_COLOR
-    return SHARED_COLOR if part.name.startswith("shared") else EFFECT_COLOR
+        return COLORS["step without effects"]
+    return COLORS.get(part.name, COLORS["effect"])

@@ -57,6 +57,15 @@ class StandIn(Solver):
         return found
 
 
+@pytree
+class StillPose(PoseEffect):
+    """Takes a pose's place where it is left out: the hair stays as it is, without the solver."""
+
+    def pose(self, rod: Rod, state: State) -> tuple[Array, Array]:
+        """Positions and orientations as they are."""
+        return state.positions, state.orientations
+
+
 def effect_names(effects: tuple[Effect, ...]) -> list[str]:
     """Names of effects: their classes; the second of one class is "Hold2"."""
     kinds = [type(effect).__name__ for effect in effects]
@@ -70,19 +79,20 @@ class Plan:
     """What is measured of a phase, and how its parts follow from it.
 
     Arguments:
-        variants: by name; "whole" and "rest" are among them.
+        variants: by name; "whole" and `rest` are among them.
         parts: for each part the variant with it and the one without it; without is "" for what is
             left when all else is left out.
-        first: the effect that makes more than half of the operations: it is left out from the
-            whole, and all others from the rest, which is the whole without it, because
-            differences of a few per cent would drown in its noise. "" where there is none; then
-            "rest" is the whole.
+        first: the effect that makes more than half of the operations, or "". It is left out from
+            the whole, and all others from the rest, which is the whole without it, because
+            differences of a few per cent would drown in its noise.
+        rest: "rest", or "whole" where there is no first.
         operations: of the whole, and what each part adds to it.
     """
 
     variants: dict[str, Variant]
     parts: dict[str, tuple[str, str]]
     first: str
+    rest: str
     operations: dict[str, float]
 
 
@@ -96,10 +106,14 @@ def plan(scene: Scene, effects: tuple[Effect, ...], state: State) -> Plan:
     posed = bool(of_kind(effects, PoseEffect))  # a pose takes the solver's place
     idle = replace(scene, solver=_stand_in(scene.solver, solves=False))
     given = replace(scene, solver=_stand_in(scene.solver, solves=True))
-    solved = idle if posed else scene
 
-    def variant(*left_out: str, scene: Scene = solved) -> Variant:
-        kept = (e for e, name in zip(effects, names, strict=True) if name not in left_out)
+    def variant(*left_out: str, scene: Scene = scene) -> Variant:
+        kept: list[Effect] = []
+        for effect, name in zip(effects, names, strict=True):
+            if name not in left_out:
+                kept.append(effect)
+            elif isinstance(effect, PoseEffect):
+                kept.append(StillPose())
         return Variant(scene, tuple(kept))
 
     def count(variant: Variant) -> float:
@@ -115,19 +129,21 @@ def plan(scene: Scene, effects: tuple[Effect, ...], state: State) -> Plan:
     counts |= {name: whole - count(variant(name)) for name in names}
     first = next((name for name in names if counts[name] > whole / 2), "")
 
-    variants = {"whole": variant(), "rest": variant(first), ITSELF: none}
+    rest = "rest" if first else "whole"
+
+    variants = {"whole": variant(), rest: variant(first), ITSELF: none}
     parts = {ITSELF: (ITSELF, "")}
     if not posed:
         variants[REST_SHAPE] = variant(first, scene=given)
         variants[ELASTICITY] = variant(first, scene=idle)
-        parts |= {REST_SHAPE: ("rest", REST_SHAPE), ELASTICITY: (REST_SHAPE, ELASTICITY)}
+        parts |= {REST_SHAPE: (rest, REST_SHAPE), ELASTICITY: (REST_SHAPE, ELASTICITY)}
     for name in names:
         if name == first:
-            parts[name] = ("whole", "rest")
+            parts[name] = ("whole", rest)
         else:
             variants[name] = variant(first, name)
-            parts[name] = ("rest", name)
-    return Plan(variants, parts, first, counts | {"whole": whole})
+            parts[name] = (rest, name)
+    return Plan(variants, parts, first, rest, counts | {"whole": whole})
 
 
 def _stand_in(solver: Solver, *, solves: bool) -> StandIn:

@@ -10,7 +10,7 @@ import jax
 
 from jaxhair.cost.measuring import BAR, Part, PhaseCost, SceneCost
 
-COLUMNS = ("time", "of the whole", "operations", "of the whole", "temporaries", "compilation")
+COLUMNS = ("time", "of the whole", "operations", "temporaries", "compilation")
 CSV_COLUMNS = (
     "phases",
     "part",
@@ -51,7 +51,8 @@ def text(cost: SceneCost) -> str:
         lines += ["", *_phase(phase, cost.scene.dt)]
     lines += [
         "",
-        f"the whole scene: {cost.scene.duration:g} s take {cost.seconds:.3g} s, "
+        "Each program is compiled once: differences of some tenths of a second are noise.",
+        f"The whole scene: {cost.scene.duration:g} s take {cost.seconds:.3g} s, "
         f"{cost.times_real_time:.3g} times real time",
     ]
     return "\n".join(lines)
@@ -59,11 +60,13 @@ def text(cost: SceneCost) -> str:
 
 def _phase(phase: PhaseCost, dt: float) -> list[str]:
     whole = phase.whole
-    rows: list[tuple[str, ...]] = [("", *COLUMNS)]
-    rows += [_row(part, whole) for part in phase.parts]
     sums = Part("sum", phase.total_seconds, phase.total_operations, None, math.nan)
-    rows += [_row(sums, whole), _row(shared(phase), whole), _row(whole, whole)]
-    rows += [_row(part, whole) for part in phase.derivatives]
+    shown = (*phase.parts, sums, shared(phase), whole, *phase.derivatives)
+    rows: list[tuple[str, ...]] = [("", *COLUMNS), *(_row(part, whole) for part in shown)]
+    if phase.first:
+        of_rest = {part.name: _percent(part.seconds / phase.rest) for part in phase.parts}
+        of_rest |= {"": f"without {phase.first}", phase.first: ""}
+        rows = [(*row[:3], of_rest.get(row[0], ""), *row[3:]) for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [f"{', '.join(phase.phases)} ({phase.steps} steps)"]
     for row in rows:
@@ -73,7 +76,7 @@ def _phase(phase: PhaseCost, dt: float) -> list[str]:
     if phase.first:
         lines.append(
             f"  {phase.first} makes more than half of the operations: all others are measured "
-            f"without it, where a step takes {_micro(phase.rest)}"
+            f"without it, in a step of {_micro(phase.rest)}"
         )
     lines += [
         f"  noise {_micro(phase.noise)}; {adding_up(phase)}",
@@ -107,16 +110,19 @@ def _row(part: Part, whole: Part) -> tuple[str, ...]:
     return (
         part.name,
         _micro(part.seconds),
-        f"{part.seconds / whole.seconds:.1%}",
+        _percent(part.seconds / whole.seconds),
         "" if math.isnan(part.operations) else f"{part.operations:,.0f}",
-        "" if math.isnan(part.operations) else f"{part.operations / whole.operations:.1%}",
         "" if part.memory is None else f"{part.memory / 1e3:,.1f} kB",
-        "" if math.isnan(part.compile_seconds) else f"{part.compile_seconds:.2f} s",
+        "" if math.isnan(part.compile_seconds) else f"{round(part.compile_seconds, 1) + 0.0:.1f} s",
     )
 
 
 def _micro(seconds: float) -> str:
-    return f"{1e6 * seconds:,.1f} us"
+    return f"{round(1e6 * seconds, 1) + 0.0:,.1f} us"  # + 0.0 because there is no -0.0 us
+
+
+def _percent(share: float) -> str:
+    return f"{round(100 * share, 1) + 0.0:.1f} %"
 
 
 def as_json(cost: SceneCost) -> dict[str, Any]:
