@@ -17,7 +17,7 @@ from jaxhair.strands import State
 BAR = 0.15
 """Within this part of it, the parts must add up to the measured whole."""
 
-ENOUGH = 3.0
+ENOUGH = 2.0
 """Seconds after which a program has been timed enough."""
 
 
@@ -126,7 +126,7 @@ def measured(
     scene: Scene,
     *,
     steps: int = 36,
-    repeat: int = 100,
+    repeat: int = 60,
     gradients: bool = False,
     progress: bool = False,
 ) -> SceneCost:
