@@ -33,8 +33,8 @@ def add_command(commands: Any) -> argparse.ArgumentParser:
         "--output", metavar="DIR", help=f"write {', '.join(FILES)} into this folder"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace files in DIR")
-    parser.add_argument("--steps", type=int, default=36, help="in each timed call (36)")
-    parser.add_argument("--repeat", type=int, default=60, help="most calls of each program (60)")
+    parser.add_argument("--steps", type=int, default=16, help="in each timed call (16)")
+    parser.add_argument("--repeat", type=int, default=200, help="most calls of each program (200)")
     parser.add_argument(
         "--gradients", action="store_true", help="measure derivatives of the whole step too"
     )

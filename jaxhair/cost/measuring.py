@@ -125,8 +125,8 @@ class SceneCost:
 def measured(
     scene: Scene,
     *,
-    steps: int = 36,
-    repeat: int = 60,
+    steps: int = 16,
+    repeat: int = 200,
     gradients: bool = False,
     progress: bool = False,
 ) -> SceneCost:
