@@ -69,9 +69,11 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
     Returns Omega_o, shape (inner points, 3, strands).
     """
     share = influence / jnp.sum(influence, axis=1, keepdims=True)
-    omega = present_shape(r[:, None], shapes)
-    held = shapes + (1 - fractions)[:, :, None] * (omega - shapes)
-    return jnp.sum(share[:, :, None] * held, axis=1)
+    held = []
+    for j in range(len(BONDS)):
+        bent = present_shape(r, shapes[:, j]) - shapes[:, j]
+        held.append(share[:, j, None] * (shapes[:, j] + (1 - fractions[:, j, None]) * bent))
+    return sum(held[1:], held[0])
 
 
 def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, Array]:
@@ -88,7 +90,8 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
     bonded = influence * fractions
     whole = jnp.sum(bonded, axis=1, keepdims=True)
     cut = whole == 0
-    shape = jnp.sum(bonded[:, :, None] * shapes, axis=1) / jnp.where(cut, 1, whole)
+    each = [bonded[:, j, None] * shapes[:, j] for j in range(len(BONDS))]
+    shape = sum(each[1:], each[0]) / jnp.where(cut, 1, whole)
     return quat.from_vector_part(shape), whole / jnp.sum(influence, axis=1, keepdims=True)
 
 
@@ -125,7 +128,7 @@ def changes(
     Returns fractions of shape (inner points, 4, strands), and for each kind (its place in
     `BONDS`) that may rise, the rise, shape (inner points, strands).
     """
-    fractions = state.fractions
+    fallen: dict[int, Array] = {}
     rises: dict[int, Array] = {}
     for j, kind in enumerate(BONDS):
         cutting = [e for e in effects if kind in e.kinds_cut]
@@ -141,23 +144,32 @@ def changes(
         if cutting:
             after = before + sum(jnp.minimum(change(e), 0) for e in cutting)
             after = jnp.maximum(after, 0)
-            fractions = fractions.at[:, j].set(after)
+            fallen[j] = after
         if forming:
             rise = sum(
                 (jnp.maximum(change(e), 0) for e in forming[1:]), jnp.maximum(change(forming[0]), 0)
             )
             rises[j] = jnp.minimum(rise, 1 - after)
-    return fractions, rises
+    return _with_kinds(state.fractions, fallen), rises
 
 
 def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
     """The state after its bonds re-formed and remember the present shape."""
     shapes, fractions = state.shapes, state.fractions
+    new, risen = {}, {}
     for j, rise in rises.items():
-        new = remembered(shapes[:, j], fractions[:, j], rise, r)
-        shapes = shapes.at[:, j].set(new)
-        fractions = fractions.at[:, j].add(rise)
-    return replace(state, shapes=shapes, fractions=fractions)
+        new[j] = remembered(shapes[:, j], fractions[:, j], rise, r)
+        risen[j] = fractions[:, j] + rise
+    return replace(
+        state, shapes=_with_kinds(shapes, new), fractions=_with_kinds(fractions, risen)
+    )
+
+
+def _with_kinds(x: Array, changed: dict[int, Array]) -> Array:
+    """x, of shape (inner points, 4, ..., strands), with some kinds' values replaced."""
+    if not changed:
+        return x
+    return jnp.stack([changed.get(j, x[:, j]) for j in range(len(BONDS))], axis=1)
 
 
 class _Toward(BondEffect):
