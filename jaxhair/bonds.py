@@ -11,6 +11,7 @@ from jax import Array
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import BondEffect
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree
 from jaxhair.rods import Rod
 from jaxhair.strands import BONDS, State
@@ -55,6 +56,7 @@ def per_inner_point(x: Any) -> Array:
     return jnp.moveaxis(x, 0, -1)
 
 
+@one_kernel
 def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> Array:
     """Omega_o = sum_j f_j {Omega_j + (1 - b_j)(Omega - Omega_j)} / sum_j f_j (Eq. 15).
 
@@ -76,6 +78,7 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
     return sum(held[1:], held[0])
 
 
+@one_kernel
 def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, Array]:
     """(Eq. 15) as one spring: Omega - Omega_o = share (Omega - shape).
 
@@ -104,6 +107,7 @@ def present_shape(r: Array, remembered: Array) -> Array:
     return quat.same_hemisphere(r, quat.from_vector_part(remembered)) * r[..., 1:, :]
 
 
+@one_kernel
 def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
     """Omega_j <- (b_j Omega_j + db_j Omega) / (b_j + db_j) where db_j > 0 (Eq. 16).
 

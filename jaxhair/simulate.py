@@ -93,7 +93,8 @@ def moved(
         r = rods.darboux(q[:-1], q[1:])
         rest = from_vector_part(bond.rest_shape(state.shapes, state.fractions, rod.influence, r))
     # 4. Elasticity, and the velocity that follows from it.
-    p, q, forces = solver.solve(rod, state, p, q, rest, dt)
+    solve = one_kernel(partial(solver.solve, dt=dt))
+    p, q, forces = solve(rod, state, p, q, rest)
     return State(p, (p - state.positions) / dt, q, state.shapes, state.fractions, forces)
 
 
