@@ -16,6 +16,7 @@ computes an expression without one again for each element that uses it: measured
 faster at 64 strands of 33 points.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxhair import quaternion as quat
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree
 
 
@@ -163,22 +165,31 @@ def _inverse(a: Array) -> Array:
 # "t" is transposed.
 
 
+@one_kernel
 def matrix_product(a: Array, b: Array) -> Array:
     """a b."""
-    return jnp.sum(a[..., :, :, None, :] * b[..., None, :, :, :], axis=-3)
+    return _over_three(lambda k: a[..., :, k, None, :] * b[..., None, k, :, :])
 
 
+def _over_three(term: Callable[[int], Array]) -> Array:
+    return term(0) + term(1) + term(2)
+
+
+@one_kernel
 def _tm(a: Array, b: Array) -> Array:
-    return jnp.sum(a[..., :, :, None, :] * b[..., :, None, :, :], axis=-4)
+    return _over_three(lambda k: a[..., k, :, None, :] * b[..., k, None, :, :])
 
 
+@one_kernel
 def _mt(a: Array, b: Array) -> Array:
-    return jnp.sum(a[..., :, None, :, :] * b[..., None, :, :, :], axis=-2)
+    return _over_three(lambda k: a[..., :, None, k, :] * b[..., None, :, k, :])
 
 
+@one_kernel
 def _mv(a: Array, v: Array) -> Array:
-    return jnp.sum(a * v[..., None, :, :], axis=-2)
+    return _over_three(lambda k: a[..., :, k, :] * v[..., k, None, :])
 
 
+@one_kernel
 def _tv(a: Array, v: Array) -> Array:
-    return jnp.sum(a * v[..., :, None, :], axis=-3)
+    return _over_three(lambda k: a[..., k, :, :] * v[..., k, None, :])
