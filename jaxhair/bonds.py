@@ -164,9 +164,7 @@ def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
     for j, rise in rises.items():
         new[j] = remembered(shapes[:, j], fractions[:, j], rise, r)
         risen[j] = fractions[:, j] + rise
-    return replace(
-        state, shapes=_with_kinds(shapes, new), fractions=_with_kinds(fractions, risen)
-    )
+    return replace(state, shapes=_with_kinds(shapes, new), fractions=_with_kinds(fractions, risen))
 
 
 def _with_kinds(x: Array, changed: dict[int, Array]) -> Array:

@@ -93,8 +93,7 @@ def moved(
         r = rods.darboux(q[:-1], q[1:])
         rest = from_vector_part(bond.rest_shape(state.shapes, state.fractions, rod.influence, r))
     # 4. Elasticity, and the velocity that follows from it.
-    solve = one_kernel(partial(solver.solve, dt=dt))
-    p, q, forces = solve(rod, state, p, q, rest)
+    p, q, forces = solver.solve(rod, state, p, q, rest, dt)
     return State(p, (p - state.positions) / dt, q, state.shapes, state.fractions, forces)
 
 
@@ -170,7 +169,8 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
     computed a second and third time instead.
     """
 
-    whole_step = one_kernel(step)
+    own = all(type(x).__module__.startswith("jaxhair.") for x in (*setup.effects, setup.solver))
+    whole_step = one_kernel(step) if own else step  # what others add may not work in a kernel
 
     def one(state: State, number: Array) -> tuple[State, None]:
         return whole_step(setup, state, number.astype(state.positions.dtype) * setup.dt), None

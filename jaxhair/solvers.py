@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxhair import check, rods
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.strands import State
@@ -199,6 +200,7 @@ def _relative_springs(rod: Rod, dt: float) -> Array:
 
 def _repeat(iteration: Callable[[Any], Any], x: Any, times: int) -> Any:
     """x after `times` iterations; in reverse mode each is computed again instead of stored."""
+    iteration = one_kernel(iteration)
     body = jax.checkpoint(lambda x, _: (iteration(x), None), prevent_cse=False)
     return lax.scan(body, x, None, length=times)[0]
 
