@@ -88,13 +88,15 @@ def _result_of_kernel(x: Array) -> Array:
     return result
 
 
-def _mark(context: mlir.LoweringRuleContext, value: ir.Value) -> list[ir.Value]:
+def _mark(context: mlir.LoweringRuleContext, value: ir.Value[Any]) -> list[ir.Value[Any]]:
     """Marks the call that made a value, if it fits into a kernel."""
     call = value.owner
     if isinstance(call, ir.Operation | ir.OpView) and call.operation.name == "func.call":
         attributes = call.operation.attributes
         if "mhlo.frontend_attributes" not in attributes and _fits(context.module_context, call):
-            marks = {name: ir.StringAttr.get(text) for name, text in _ATTRIBUTES.items()}
+            marks: dict[str, ir.Attribute] = {
+                n: ir.StringAttr.get(x) for n, x in _ATTRIBUTES.items()
+            }
             attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(marks)
     return [value]
 
@@ -103,7 +105,7 @@ mlir.register_lowering(_identity, _mark, platform="cpu", cacheable=False)
 
 
 def _fits(module: mlir.ModuleContext, call: Any) -> bool:
-    """Whether all operations in a call are known to work inside a kernel, on arrays small enough."""
+    """Whether all in a call is known to work inside a kernel, on arrays small enough."""
     callee = ir.FlatSymbolRefAttr(call.operation.attributes["callee"]).value
     return all(_works(module, op) for op in module.symbol_table[callee].regions[0].blocks[0])
 

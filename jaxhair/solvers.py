@@ -213,7 +213,7 @@ def _sequential(
     In one sweep, since an inner point waits for nothing but the two edges beside it: behind each
     edge comes the inner point before it.
     """
-    of_first, of_others = (jax.tree.map(lambda x: x[rows], at[0]) for rows in (0, slice(1, None)))
+    of_first, of_others = _first_and_others(at[0])
 
     def next_edge(before: Any, here: Any) -> tuple[Any, Any]:
         p1, q1 = before
@@ -224,7 +224,7 @@ def _sequential(
 
     def iteration(x: Any) -> Any:
         p, q, (of_edges, of_inner) = x
-        first, others = (jax.tree.map(lambda x: x[rows], of_edges) for rows in (0, slice(1, None)))
+        first, others = _first_and_others(of_edges)
         root, p1, q1, first = edge(p[0], p[1], q[0], first, of_first)
         rows = (p[2:], q[1:], others, of_inner, of_others, at[1])
         (tip, last), (p, q, others, of_inner) = lax.scan(next_edge, (p1, q1), rows)
@@ -233,6 +233,11 @@ def _sequential(
         return p, q, (of_edges, of_inner)
 
     return _repeat(iteration, (p, q, m), iterations)[:2]
+
+
+def _first_and_others(x: Any) -> tuple[Any, Any]:
+    """The first row and the others of every array in x."""
+    return jax.tree.map(lambda a: a[0], x), jax.tree.map(lambda a: a[1:], x)
 
 
 def _red_black(

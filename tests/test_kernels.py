@@ -171,7 +171,7 @@ def test_a_step_with_any_effect_but_contact_is_one_kernel(effects: Any, solver: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("points, strands", [(9, 290), (33, 64), (100, 20)])
+@pytest.mark.parametrize(("points", "strands"), [(9, 290), (33, 64), (100, 20)])
 @pytest.mark.parametrize("solver", [jh.PositionBased(), jh.Compliant(), jh.Direct()], ids=str)
 @pytest.mark.parametrize("effects", EFFECTS.values(), ids=EFFECTS)
 def test_steps_of_the_largest_size_compile(
