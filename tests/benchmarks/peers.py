@@ -17,11 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxhair as jh
-from jaxhair.effects import BondEffect
 from jaxhair.simulate import phase_end, start
 
 SIZES = ((200, 9), (100, 17), (10_000, 9), (1_000, 100))
@@ -34,24 +32,13 @@ SOLVERS = {
 OTHERS = {"numba, vectorised": "nb_flat.py", "numba, plain": "nb_rods.py"}
 
 
-@jh.pytree
-class Rising(jh.Reform, BondEffect):
-    """As the peers have it: fractions rise by the same amount in every step."""
-
-    def fraction_change(self, kind: str, fraction: Any, rod: Any, state: Any, dt: float) -> Any:
-        """0.002 of the hydrogen bonds, 0.001 of the disulfide bonds."""
-        return jnp.full_like(fraction, 0.002 if kind == "hydrogen" else 0.001)
-
-
-Rising.__module__ = "jaxhair.bonds"  # so that a step of it may be one kernel
-
-
 def scene(strands: int, points: int, solver: Any) -> jh.Scene:
     """The peers' scene."""
     roots = 0.01 * np.random.default_rng(0).normal(size=(strands, 3))
     length = 0.03 * (points - 1)
     hair = jh.Strands.straight(roots.astype(np.float32), (1, 0, 0), length=length, points=points)
-    effects = (jh.Gravity(), jh.Hold(), Rising(hydrogen=1.0, disulfide=1.0), jh.Drag(2.8))
+    rising = jh.Reform(hydrogen=1.0, disulfide=1.0, rate=0.5)
+    effects = (jh.Gravity(), jh.Hold(), rising, jh.Drag(2.8))
     bonds = jh.Bonds((1.0, 0.5, 0.3, 0.2), fraction=(0.9, 0.5, 0.99, 0.8))
     return jh.Scene(hair, bonds=bonds, phases=(jh.Phase("fall", 1.0, effects),), solver=solver)
 
