@@ -11,6 +11,7 @@ from jax import Array
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import BondEffect
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree
 from jaxhair.rods import Rod
 from jaxhair.strands import BONDS, State
@@ -55,6 +56,7 @@ def per_inner_point(x: Any) -> Array:
     return jnp.moveaxis(x, 0, -1)
 
 
+@one_kernel
 def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> Array:
     """Omega_o = sum_j f_j {Omega_j + (1 - b_j)(Omega - Omega_j)} / sum_j f_j (Eq. 15).
 
@@ -69,11 +71,14 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
     Returns Omega_o, shape (inner points, 3, strands).
     """
     share = influence / jnp.sum(influence, axis=1, keepdims=True)
-    omega = present_shape(r[:, None], shapes)
-    held = shapes + (1 - fractions)[:, :, None] * (omega - shapes)
-    return jnp.sum(share[:, :, None] * held, axis=1)
+    held = []
+    for j in range(len(BONDS)):
+        bent = present_shape(r, shapes[:, j]) - shapes[:, j]
+        held.append(share[:, j, None] * (shapes[:, j] + (1 - fractions[:, j, None]) * bent))
+    return sum(held[1:], held[0])
 
 
+@one_kernel
 def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, Array]:
     """(Eq. 15) as one spring: Omega - Omega_o = share (Omega - shape).
 
@@ -88,7 +93,8 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
     bonded = influence * fractions
     whole = jnp.sum(bonded, axis=1, keepdims=True)
     cut = whole == 0
-    shape = jnp.sum(bonded[:, :, None] * shapes, axis=1) / jnp.where(cut, 1, whole)
+    each = [bonded[:, j, None] * shapes[:, j] for j in range(len(BONDS))]
+    shape = sum(each[1:], each[0]) / jnp.where(cut, 1, whole)
     return quat.from_vector_part(shape), whole / jnp.sum(influence, axis=1, keepdims=True)
 
 
@@ -101,6 +107,7 @@ def present_shape(r: Array, remembered: Array) -> Array:
     return quat.same_hemisphere(r, quat.from_vector_part(remembered)) * r[..., 1:, :]
 
 
+@one_kernel
 def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
     """Omega_j <- (b_j Omega_j + db_j Omega) / (b_j + db_j) where db_j > 0 (Eq. 16).
 
@@ -125,7 +132,7 @@ def changes(
     Returns fractions of shape (inner points, 4, strands), and for each kind (its place in
     `BONDS`) that may rise, the rise, shape (inner points, strands).
     """
-    fractions = state.fractions
+    fallen: dict[int, Array] = {}
     rises: dict[int, Array] = {}
     for j, kind in enumerate(BONDS):
         cutting = [e for e in effects if kind in e.kinds_cut]
@@ -141,23 +148,30 @@ def changes(
         if cutting:
             after = before + sum(jnp.minimum(change(e), 0) for e in cutting)
             after = jnp.maximum(after, 0)
-            fractions = fractions.at[:, j].set(after)
+            fallen[j] = after
         if forming:
             rise = sum(
                 (jnp.maximum(change(e), 0) for e in forming[1:]), jnp.maximum(change(forming[0]), 0)
             )
             rises[j] = jnp.minimum(rise, 1 - after)
-    return fractions, rises
+    return _with_kinds(state.fractions, fallen), rises
 
 
 def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
     """The state after its bonds re-formed and remember the present shape."""
     shapes, fractions = state.shapes, state.fractions
+    new, risen = {}, {}
     for j, rise in rises.items():
-        new = remembered(shapes[:, j], fractions[:, j], rise, r)
-        shapes = shapes.at[:, j].set(new)
-        fractions = fractions.at[:, j].add(rise)
-    return replace(state, shapes=shapes, fractions=fractions)
+        new[j] = remembered(shapes[:, j], fractions[:, j], rise, r)
+        risen[j] = fractions[:, j] + rise
+    return replace(state, shapes=_with_kinds(shapes, new), fractions=_with_kinds(fractions, risen))
+
+
+def _with_kinds(x: Array, changed: dict[int, Array]) -> Array:
+    """x, of shape (inner points, 4, ..., strands), with some kinds' values replaced."""
+    if not changed:
+        return x
+    return jnp.stack([changed.get(j, x[:, j]) for j in range(len(BONDS))], axis=1)
 
 
 class _Toward(BondEffect):

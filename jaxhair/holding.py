@@ -54,10 +54,11 @@ class Hold(HoldingEffect):
         return held if self.clamped else jnp.zeros_like(held)
 
     def _end(self, exists: Array, ragged: bool) -> Array:
+        none = jnp.zeros_like(exists)
         if self.part == "root":
-            return jnp.zeros_like(exists).at[0].set(True)
+            return jnp.concatenate([~none[:1], none[1:]])
         if not ragged:
-            return jnp.zeros_like(exists).at[-1].set(True)
+            return jnp.concatenate([none[:-1], ~none[-1:]])
         after = jnp.concatenate([exists[1:], jnp.zeros_like(exists[:1])])
         return exists & ~after
 

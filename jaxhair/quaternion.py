@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jaxhair.kernels import one_kernel
+
 
 def dot(a: Array, b: Array) -> Array:
     """a . b over the component axis, which is kept with size 1."""
@@ -24,9 +26,14 @@ def safe_norm(x: Array) -> Array:
 
 def unit(x: Array) -> Array:
     """x / |x| over the component axis; 0 where x = 0, with derivative 0 there."""
+    return x * _inverse_norm(x)
+
+
+@one_kernel
+def _inverse_norm(x: Array) -> Array:
     square = dot(x, x)
     zero = square == 0
-    return x * jnp.where(zero, 0, lax.rsqrt(jnp.where(zero, 1, square)))
+    return jnp.where(zero, 0, lax.rsqrt(jnp.where(zero, 1, square)))
 
 
 def cross(a: Array, b: Array) -> Array:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxhair import quaternion as quat
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
 
 
@@ -140,6 +141,7 @@ def stretch_shear_factors(
     )
 
 
+@one_kernel
 def stretch_shear_violation(p1: Array, p2: Array, q: Array, length: Array) -> Array:
     """C_s = gamma = (p2 - p1) / l - R(q) e3 (Eq. 1, Eq. 5)."""
     return (p2 - p1) / length - quat.tangent(q)
@@ -180,6 +182,7 @@ def bend_twist_factors(w1: Array, w2: Array, stiffness: Array) -> tuple[Array, A
     return _share(stiffness * w1, w1 + w2), _share(stiffness * w2, w1 + w2)
 
 
+@one_kernel
 def darboux(q1: Array, q2: Array) -> Array:
     """conj(q1) q2 (Eq. 8), whose vector part is Omega. The real part is kept for (Eq. 7)."""
     return quat.relative(q1, q2)
@@ -205,6 +208,7 @@ def damped(rod: Rod, spring: Array, shape: Array, before: Array, dt: Any) -> tup
     return spring * (1 + rate), quat.from_vector_part(between)
 
 
+@one_kernel
 def bend_twist_violation(r: Array, rest: Array) -> Array:
     """C_b = Omega - s Omega_o (Eq. 6), with s = +1 or -1, whichever is nearer (Eq. 7, Eq. 11).
 

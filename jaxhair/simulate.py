@@ -22,6 +22,7 @@ from jaxhair.effects import (
     of_kind,
 )
 from jaxhair.fibre import Fibre, PhysicalFibre, material, stiffness
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
@@ -168,8 +169,11 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
     computed a second and third time instead.
     """
 
+    own = all(type(x).__module__.startswith("jaxhair.") for x in (*setup.effects, setup.solver))
+    whole_step = one_kernel(step) if own else step  # what others add may not work in a kernel
+
     def one(state: State, number: Array) -> tuple[State, None]:
-        return step(setup, state, number.astype(state.positions.dtype) * setup.dt), None
+        return whole_step(setup, state, number.astype(state.positions.dtype) * setup.dt), None
 
     def many(state: State, numbers: Array) -> tuple[State, None]:
         return lax.scan(jax.checkpoint(one, prevent_cse=False), state, numbers)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxhair import check, rods
+from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.strands import State
@@ -199,6 +200,7 @@ def _relative_springs(rod: Rod, dt: float) -> Array:
 
 def _repeat(iteration: Callable[[Any], Any], x: Any, times: int) -> Any:
     """x after `times` iterations; in reverse mode each is computed again instead of stored."""
+    iteration = one_kernel(iteration)
     body = jax.checkpoint(lambda x, _: (iteration(x), None), prevent_cse=False)
     return lax.scan(body, x, None, length=times)[0]
 
@@ -206,26 +208,36 @@ def _repeat(iteration: Callable[[Any], Any], x: Any, times: int) -> Any:
 def _sequential(
     iterations: int, edge: Any, inner: Any, p: Array, q: Array, m: Any, at: Any
 ) -> tuple[Array, Array]:
-    """Edges from root to tip, then inner points from root to tip."""
+    """Edges from root to tip, then inner points from root to tip.
 
-    def next_edge(p1: Array, here: Any) -> tuple[Array, Any]:
-        p2, q, m, at = here
-        p1, p2, q, m = edge(p1, p2, q, m, at)
-        return p2, (p1, q, m)
+    In one sweep, since an inner point waits for nothing but the two edges beside it: behind each
+    edge comes the inner point before it.
+    """
+    of_first, of_others = _first_and_others(at[0])
 
-    def next_inner(q1: Array, here: Any) -> tuple[Array, Any]:
-        q2, m, at = here
-        q1, q2, m = inner(q1, q2, m, at)
-        return q2, (q1, m)
+    def next_edge(before: Any, here: Any) -> tuple[Any, Any]:
+        p1, q1 = before
+        p2, q2, m_edge, m_inner, at_edge, at_inner = here
+        p1, p2, q2, m_edge = edge(p1, p2, q2, m_edge, at_edge)
+        q1, q2, m_inner = inner(q1, q2, m_inner, at_inner)
+        return (p2, q2), (p1, q1, m_edge, m_inner)
 
     def iteration(x: Any) -> Any:
         p, q, (of_edges, of_inner) = x
-        tip, (p, q, of_edges) = lax.scan(next_edge, p[0], (p[1:], q, of_edges, at[0]))
-        last, (head, of_inner) = lax.scan(next_inner, q[0], (q[1:], of_inner, at[1]))
-        p, q = jnp.concatenate([p, tip[None]]), jnp.concatenate([head, last[None]])
+        first, others = _first_and_others(of_edges)
+        root, p1, q1, first = edge(p[0], p[1], q[0], first, of_first)
+        rows = (p[2:], q[1:], others, of_inner, of_others, at[1])
+        (tip, last), (p, q, others, of_inner) = lax.scan(next_edge, (p1, q1), rows)
+        of_edges = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, others)
+        p, q = jnp.concatenate([root[None], p, tip[None]]), jnp.concatenate([q, last[None]])
         return p, q, (of_edges, of_inner)
 
     return _repeat(iteration, (p, q, m), iterations)[:2]
+
+
+def _first_and_others(x: Any) -> tuple[Any, Any]:
+    """The first row and the others of every array in x."""
+    return jax.tree.map(lambda a: a[0], x), jax.tree.map(lambda a: a[1:], x)
 
 
 def _red_black(
