@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fitting.command_line import STRAND_UNITS, add_strand_files, add_work, status
-from fitting.many import SHARES, FitEach, fit_each, quantiles
+from fitting.many import SHARES, FitEach, quantiles
 from fitting.measures import curl
 from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
 from fitting.report import plain, versions
@@ -84,10 +84,7 @@ def _natural(options: argparse.Namespace) -> int:
         progress=None if options.quiet else _holding(),
         checkpoint=None if kept is None else kept / "stiffness",
     )
-    found = fit_each(
-        hair.scene,
-        hair.targets,
-        hair.free,
+    found = hair.fit(
         progress=None if options.quiet else _fitting(),
         checkpoint=None if kept is None else kept / "fit",
     )
@@ -235,6 +232,8 @@ def _rows(hair: Natural, found: FitEach, remembered: np.ndarray) -> list[dict[st
                 label = name if kind is None else f"{name}[{kind}]"
                 columns[label] = value if kind is None else value[:, j]
                 columns[f"{label} error"] = error if kind is None else error[:, j]
+    for label, ends in (found.intervals or {}).items():
+        columns[f"{label} interval"] = ends  # null: without end
     places = np.where(found.fitted, np.cumsum(found.fitted) - 1, -1)
     return [
         {

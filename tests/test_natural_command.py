@@ -1,6 +1,7 @@
 """Natural strands from files on disk: what the command finds, writes, refuses and goes on from."""
 
 import json
+import platform
 import struct
 import sys
 from dataclasses import replace
@@ -100,6 +101,7 @@ def test_a_data_file_in_its_own_unit_and_axes(
     assert main(["natural", str(path), *command.split(), str(folder)]) == 0
     printed = capsys.readouterr().out
     assert "no picture: pictures need matplotlib" in printed
+    assert report(folder)["versions"]["python"] == platform.python_version()
     assert "simulation" not in printed.split("strands fitted")[0]
     assert {p.name for p in folder.iterdir()} == {
         "natural.json", "natural.hair", "remembered.hair"
