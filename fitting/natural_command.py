@@ -32,8 +32,8 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m fitting natural",
         description="Finds for each strand of a file the shape that its bonds must remember for it "
         "to hang as it does; and, where the same strands were seen without weight too, its "
-        "hydrogen bonds' influence and its cuticle's peeling rate. Says how near each strand "
-        "comes, and which strands cannot be fitted and why.",
+        "hydrogen bonds' influence and its cuticle's peeling rate, with their intervals. Says how "
+        "near each strand comes, and which strands cannot be fitted and why.",
         epilog=f"Writes {REPORT}, {PICTURE} and, of the strands that were fitted, "
         f"{STRANDS[STATE]} (as simulated) and {STRANDS[REMEMBERED]} (as they are remembered). "
         "example: python -m fitting natural head.hair --unit cm --up y --output natural",

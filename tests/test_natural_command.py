@@ -15,6 +15,7 @@ from natural_head import FAULTS, STYLES, head
 import fitting
 import jaxhair as jh
 from fitting.__main__ import main
+from fitting.clamped import rooted
 from fitting.polylines import cleaned, evenly
 from jaxhair.checkpoints import Checkpoints
 
@@ -127,7 +128,7 @@ def test_hanging_and_unloaded_files_show_hydrogen_and_wear(tmp_path: Path) -> No
     fibre = replace(start.scene.fibre, peeling_rate=rates)
     ends = jh.run(replace(start.scene, bonds=jh.Bonds(influence), fibre=fibre))
     for name in ("natural", "unloaded"):
-        points = np.asarray(ends[name].points)
+        points = rooted(np.asarray(ends[name].points))
         jh.write_curves(tmp_path / f"{name}.hair", jh.Curves.from_list(points), unit=0.01)
     command = ["natural", str(tmp_path / "natural.hair"), "--points", "17", "--unit", "cm"]
     command += ["--unloaded", str(tmp_path / "unloaded.hair"), "--output", str(tmp_path / "out")]
@@ -140,6 +141,10 @@ def test_hanging_and_unloaded_files_show_hydrogen_and_wear(tmp_path: Path) -> No
     for row, rate in zip(rows, rates, strict=True):
         off = row["fibre.peeling_rate"] - rate
         assert abs(off) < max(3 * row["fibre.peeling_rate error"], 0.1 * rate)
+        assert row["residual_mm"] < 0.1
+        for name in ("bonds.influence[hydrogen]", "fibre.peeling_rate"):
+            low, high = row[f"{name} interval"]
+            assert low < row[name] < high
     assert len(jh.read_curves(tmp_path / "out" / "unloaded.hair").counts) == 3
 
 
