@@ -39,8 +39,8 @@ def widened(
     seen: Seen,
     found: FitEach,
 ) -> FitEach:
-    """A fit with errors^2 = sum d_b^2 / draws + (1.8 d_finer)^2 + its own errors^2 for steps d, and
-    with intervals of 95 %, ends included, shape (strands, 2).
+    """A fit with errors^2 = sum d_b^2 / draws + (1.8 d_finer)^2 + its own errors^2, for steps d, +
+    what no data hold, and with intervals of 95 %, ends included, shape (strands, 2).
 
     An interval is made where the number has no bounds, and taken back. That of the peeling rate s
     is made in the mean share of the cuticle that is lost on a strand of length L, s L / 2 up to
@@ -53,7 +53,7 @@ def widened(
     points = scene.strands.points
     hanging, unloaded = seen.chains(points, DRAWS)
     finer = seen.chains(round(FINER * (points - 1)) + 1)
-    moved, away = (
+    (moved, loose), (away, _) = (
         steps(scene, free, dict(zip(states, shapes, strict=True)), states[1], seen.noise_mm, found)
         for shapes in ((hanging[1:], unloaded[1:]), finer)
     )
@@ -61,7 +61,7 @@ def widened(
     own = np.concatenate([found.number_errors[p.name] for p in parameters], axis=1)
     few = t.ppf((1 + LEVEL) / 2, DRAWS) / norm.ppf((1 + LEVEL) / 2)  # few draws say less
     chain = away[0] / (1 - FINER**-2)
-    variance = few**2 * (moved**2).mean(axis=0) + chain**2 + own**2
+    variance = few**2 * (moved**2).mean(axis=0) + loose.mean(axis=0) + chain**2 + own**2
     x = np.concatenate([found.numbers[p.name] for p in parameters], axis=1)
     covariance = variance[:, :, None] * np.eye(x.shape[1])
     with np.errstate(over="ignore"):
@@ -78,9 +78,11 @@ def steps(
     remembered: str,
     noise_mm: float,
     found: FitEach,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Newton steps d = -(J' J + 1 / WIDTH^2)^-1 (J' r + (x - x_0) / WIDTH^2) from the numbers x
-    found, with other shapes in the place of the scene's; shape (draws, strands, numbers).
+    found, with other shapes in the place of the scene's; and the squares by which the data leave
+    each number to the prior, WIDTH^2 where they say nothing. Both of shape (draws, strands,
+    numbers).
 
     Arguments:
         shapes: of each phase's end [m], shape (draws, strands, points, 3). remembered: the phase
@@ -100,7 +102,9 @@ def steps(
     slope = np.where(known[:, None], sums.slope + (x - start) / WIDTH**2, 0)
     d = -np.linalg.solve(curvature, slope[..., None])[..., 0]
     d[~known] = WIDTH
-    return np.clip(d, -WIDTH, WIDTH).reshape(draws, count, -1)
+    loose = (np.linalg.inv(curvature) ** 2).sum(axis=2) / WIDTH**2
+    shape = draws, count, x.shape[1]
+    return np.clip(d, -WIDTH, WIDTH).reshape(shape), loose.reshape(shape)
 
 
 def _intervals(found: FitEach, scene: Scene, lengths: np.ndarray) -> dict[str, np.ndarray]:

@@ -159,6 +159,7 @@ def test_intervals_of_noisy_strands_hold_the_truth() -> None:
     assert (np.median(widths, axis=1) < 0.6).all()
 
 
+@pytest.mark.slow
 def test_straight_strands_leave_hydrogen_and_wear_open() -> None:
     """They hang straight down, loaded and not: nothing shows in them."""
     line = np.linspace(0, 0.1, 30)[:, None] * np.array([0.0, 0.0, -1.0])
