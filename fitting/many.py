@@ -8,7 +8,7 @@ with a damping for each strand.
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +43,7 @@ class FitEach:
         converged: whether a strand met the tolerance.
         reasons: why a strand could not be fitted; None where it was.
         steps: simulations that a strand took. seconds: of all, compilation included.
+        intervals: of 95 %, shape (strands, 2), where they were made; see `fitting.widened`.
     """
 
     values: dict[str, np.ndarray]
@@ -54,6 +55,7 @@ class FitEach:
     reasons: tuple[str | None, ...]
     steps: np.ndarray
     seconds: float
+    intervals: dict[str, np.ndarray] | None = None
 
     @property
     def fitted(self) -> np.ndarray:
@@ -188,28 +190,40 @@ def fit_each(
             reasons[i] = f"residual of {residual:.3g} mm, above {bar:.3g} mm"
     spread = np.maximum(1, found.sums.square / max(problem.residuals - start.shape[1], 1))
     normal = found.sums.curvature / spread[:, None, None] + np.eye(start.shape[1]) / prior_width**2
-    values, errors, numbers, number_errors = {}, {}, {}, {}
-    begins = np.cumsum([0, *(p.size for p in parameters)])
     with np.errstate(all="ignore"):
         covariance = _inverse(normal)
-        for p, first, last in zip(parameters, begins[:-1], begins[1:], strict=True):
-            numbers[p.name] = found.x[:, first:last]
-            own = covariance[:, first:last, first:last]
-            number_errors[p.name] = np.sqrt(np.einsum("sii->si", own))
-            values[p.name], errors[p.name] = tiles.values_and_errors(
-                p, numbers[p.name], own, scene.dtype
-            )
+        estimated = estimates(parameters, found.x, covariance, scene.dtype)
     return FitEach(
-        values=values,
-        errors=errors,
-        numbers=numbers,
-        number_errors=number_errors,
+        **estimated,
         residual_mm=found.sums.residual_mm,
         converged=found.converged,
         reasons=tuple(reasons),
         steps=found.steps,
         seconds=time.perf_counter() - begin,
     )
+
+
+def estimates(
+    parameters: Sequence[tiles.Freed], x: np.ndarray, covariance: np.ndarray, dtype: Any
+) -> dict[str, dict[str, np.ndarray]]:
+    """Values, numbers and their errors, by a parameter's name, as `FitEach` has them.
+
+    Arguments:
+        x: free numbers, shape (strands, n). covariance: theirs, shape (strands, n, n).
+    """
+    values, errors, numbers, number_errors = {}, {}, {}, {}
+    begins = np.cumsum([0, *(p.size for p in parameters)])
+    for p, first, last in zip(parameters, begins[:-1], begins[1:], strict=True):
+        numbers[p.name] = x[:, first:last]
+        own = covariance[:, first:last, first:last]
+        number_errors[p.name] = np.sqrt(np.einsum("sii->si", own))
+        values[p.name], errors[p.name] = tiles.values_and_errors(p, numbers[p.name], own, dtype)
+    return {
+        "values": values,
+        "errors": errors,
+        "numbers": numbers,
+        "number_errors": number_errors,
+    }
 
 
 def _checked(scene: Scene, targets: Mapping[str, Target]) -> dict[str, Target]:

@@ -1,7 +1,7 @@
 """Natural strands, as files have them: what shape they remember, and what of it may be fitted.
 
     hair = natural(jh.read_curves("head.hair", unit=0.01))
-    print(hair.table(fit_each(hair.scene, hair.targets, hair.free)))
+    print(hair.table(hair.fit()))
 
 A strand that hangs is drawn out by its weight: the shape that its bonds remember is curled more
 than what is seen. The moments that weight puts on a strand of known stiffness follow from its
@@ -20,7 +20,7 @@ hair's stiffness does not keep it as it was seen, the least of some multiples is
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,12 +28,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.clamped import Seen, off_mm, rooted
 from fitting.constraints import Constraint, Positive, Scale, Share
 from fitting.ends import in_tiles
 from fitting.hanging import STIFFER, Counted, held_up, take, times
-from fitting.many import FitEach, distribution, not_fitted
+from fitting.many import FitEach, distribution, fit_each, not_fitted
+from fitting.optimisers import Progress
 from fitting.polylines import cleaned, evenly, listed, turns
 from fitting.targets import MM, Shape, Target
+from fitting.widened import widened
 from jaxhair import (
     Bonds,
     Curves,
@@ -70,6 +73,7 @@ class Natural:
         left: from the place of a strand that is not in the scene to the reason.
         resampling_mm: root mean square distance of each strand's given points from the chain of
             edges that is simulated in their place [mm], shape (strands,).
+        seen: strands seen both hanging and without weight: all curves that they may be.
     """
 
     scene: Scene
@@ -79,11 +83,28 @@ class Natural:
     stiffer: np.ndarray
     left: dict[int, str]
     resampling_mm: np.ndarray
+    seen: Seen | None = None
+
+    def fit(
+        self,
+        *,
+        progress: Progress | None = None,
+        checkpoint: str | os.PathLike[str] | None = None,
+    ) -> FitEach:
+        """`fit_each` of the strands; where they were seen with and without weight, with the noise
+        that their points have, and errors that count how uncertain it makes the shapes."""
+        options: dict[str, Any] = {"progress": progress, "checkpoint": checkpoint}
+        if self.seen is None:
+            return fit_each(self.scene, self.targets, self.free, **options)
+        noise = self.seen.noise_mm
+        found = fit_each(self.scene, self.targets, self.free, noise_mm=noise, **options)
+        return widened(self.scene, self.free, (STATE, UNLOADED), self.seen, found)
 
     @property
     def lengths(self) -> np.ndarray:
         """Of the strands [m], shape (strands,)."""
-        return np.asarray(self.scene.strands.lengths, float).sum(axis=1)
+        edges = np.asarray(self.scene.strands.lengths, float)
+        return edges.sum(axis=1) - (0 if self.seen is None else edges[:, 0] / 2)
 
     def of_length(self, found: FitEach) -> np.ndarray:
         """Residuals of a fit in lengths of the strand, shape (strands,)."""
@@ -101,10 +122,11 @@ class Natural:
             *in_tiles(fitted, tuple(self.targets)),
             *in_tiles(replace(fitted, phases=unloaded), (REMEMBERED,)),
         )
-        return {
+        points = {
             state: np.concatenate([tile[state] for _, tile in ends if state in tile])
             for state in (*self.targets, REMEMBERED)
         }
+        return points if self.seen is None else {n: rooted(x) for n, x in points.items()}
 
     def reasons(self, found: FitEach) -> dict[int, str]:
         """Why strands could not be fitted, by their places among those given."""
@@ -189,17 +211,29 @@ def natural(
             left[i] = bad[0]
         else:
             kept[i] = [x for x in each if not isinstance(x, str)]
-    whole = np.array([max(turns(x).sum() for x in several) for several in kept.values()])
+    seen_twice: Seen | None = None
+    smooth: Iterable[Sequence[np.ndarray]] = kept.values()
+    if unloaded is not None and kept:
+        seen_twice = Seen.of(*zip(*kept.values(), strict=True))
+        smooth = zip(*(x[0] for x in seen_twice.chains(MOST_POINTS)), strict=True)
+    whole = np.array([max(turns(x).sum() for x in several) for several in smooth])
     if points is None:
         wanted = np.quantile(whole, 0.95) / TURN + 2 if kept else LEAST_POINTS
         points = int(np.clip(np.ceil(wanted), LEAST_POINTS, MOST_POINTS))
     check.whole("points", points, least=4, most=100_000)
-    for i, turn in zip(list(kept), whole / (points - 2), strict=True):
-        if turn > 2 * TURN:
-            left[i] = f"turns by {turn:.1f} rad between the edges of {points} points"
+    turn = whole / (points - 2)
+    for i, each_turn in zip(list(kept), turn, strict=True):
+        if each_turn > 2 * TURN:
+            left[i] = f"turns by {each_turn:.1f} rad between the edges of {points} points"
             del kept[i]
     _refuse_none(kept, left)
-    shapes, off = zip(*(evenly(x, points) for x in zip(*kept.values(), strict=True)), strict=True)
+    strands_of = list(zip(*kept.values(), strict=True))
+    if seen_twice is not None:
+        seen_twice = seen_twice.take(np.flatnonzero(turn <= 2 * TURN).tolist())
+        shapes = tuple(x[0] for x in seen_twice.chains(points))
+        off = [off_mm(x, chain) for x, chain in zip(strands_of, shapes, strict=True)]
+    else:
+        shapes, off = zip(*(evenly(x, points) for x in strands_of), strict=True)
     resampling = np.max(off, axis=0)
     hair = Strands.from_points(jnp.asarray(shapes[-1], dtype))
     phases: tuple[Phase, ...] = (Phase(STATE, seconds, (Hold(),)),)
@@ -211,8 +245,6 @@ def natural(
     if unloaded is not None:
         phases = (Phase(UNLOADED, treatments.AT_ONCE, (Unloaded(),)), *phases)
         targets[UNLOADED] = Shape(shapes[1])
-        roots = shapes[1][:, :1] - shapes[0][:, :1]
-        shapes = (shapes[0] + roots, shapes[1])  # roots in the same place
         free["bonds.influence"] = Share(BONDS.index("hydrogen"))
         free["fibre.peeling_rate"] = Positive()
     elif weight:
@@ -235,6 +267,7 @@ def natural(
         stiffer,
         dict(sorted(left.items())),
         resampling,
+        seen_twice,
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fitting.command_line import STRAND_UNITS, add_strand_files, add_work, status
-from fitting.many import SHARES, FitEach, fit_each, quantiles
+from fitting.many import SHARES, FitEach, quantiles
 from fitting.measures import curl
 from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
 from fitting.report import plain, versions
@@ -32,8 +32,8 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m fitting natural",
         description="Finds for each strand of a file the shape that its bonds must remember for it "
         "to hang as it does; and, where the same strands were seen without weight too, its "
-        "hydrogen bonds' influence and its cuticle's peeling rate. Says how near each strand "
-        "comes, and which strands cannot be fitted and why.",
+        "hydrogen bonds' influence and its cuticle's peeling rate, with their intervals. Says how "
+        "near each strand comes, and which strands cannot be fitted and why.",
         epilog=f"Writes {REPORT}, {PICTURE} and, of the strands that were fitted, "
         f"{STRANDS[STATE]} (as simulated) and {STRANDS[REMEMBERED]} (as they are remembered). "
         "example: python -m fitting natural head.hair --unit cm --up y --output natural",
@@ -84,10 +84,7 @@ def _natural(options: argparse.Namespace) -> int:
         progress=None if options.quiet else _holding(),
         checkpoint=None if kept is None else kept / "stiffness",
     )
-    found = fit_each(
-        hair.scene,
-        hair.targets,
-        hair.free,
+    found = hair.fit(
         progress=None if options.quiet else _fitting(),
         checkpoint=None if kept is None else kept / "fit",
     )
@@ -235,6 +232,8 @@ def _rows(hair: Natural, found: FitEach, remembered: np.ndarray) -> list[dict[st
                 label = name if kind is None else f"{name}[{kind}]"
                 columns[label] = value if kind is None else value[:, j]
                 columns[f"{label} error"] = error if kind is None else error[:, j]
+    for label, ends in (found.intervals or {}).items():
+        columns[f"{label} interval"] = ends  # null: without end
     places = np.where(found.fitted, np.cumsum(found.fitted) - 1, -1)
     return [
         {

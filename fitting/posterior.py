@@ -7,7 +7,6 @@ package blackjax, which the extra `posterior` installs.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import jax
@@ -18,6 +17,7 @@ from jax import Array
 from fitting.fit import Fit
 from fitting.optimisers import METHODS, strong
 from jaxhair import check
+from jaxhair.extras import optional
 
 ACCEPTED = 0.8
 """Share of proposals that the step size is adapted to."""
@@ -121,8 +121,10 @@ def posterior(
     spread = found.uncertainty
     if not np.isfinite(spread.covariance).all():
         raise ValueError("the fit's covariance is not finite; its values must be")
-    nuts, diagnostics = _blackjax("mcmc.nuts"), _blackjax("diagnostics")
-    adaptation = _blackjax("adaptation.step_size")
+    nuts, diagnostics, adaptation = (
+        optional(f"blackjax.{name}", "posterior")
+        for name in ("mcmc.nuts", "diagnostics", "adaptation.step_size")
+    )
     begin = time.perf_counter()
     parameters = found.problem.parameters
     dtype = found.problem.start.dtype
@@ -221,13 +223,3 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(covariance)
     root: np.ndarray = vectors * np.sqrt(np.maximum(values, np.finfo(float).tiny))
     return root
-
-
-def _blackjax(module: str) -> Any:
-    """A module of the package that only this needs."""
-    try:
-        return import_module(f"blackjax.{module}")
-    except ImportError as error:
-        raise ImportError(
-            'the posterior needs blackjax: pip install "jaxhair[posterior]"'
-        ) from error

@@ -92,7 +92,7 @@ def as_json(fit: "Fit", **more: Any) -> dict[str, Any]:
         "simulations": fit.steps,
         "seconds": fit.seconds,
         "settings": fit.settings,
-        "versions": {"python": platform.python_version(), **versions()},
+        "versions": versions(),
         **more,
     }
 
@@ -106,8 +106,8 @@ def plain(value: Any) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that results depend on."""
-    found = {}
+    """Of Python and the packages that results depend on."""
+    found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
             found[package] = version(package)

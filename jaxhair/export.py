@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxhair import check
 from jaxhair.arrays import write_arrays
+from jaxhair.extras import optional
 from jaxhair.files import Curves, write_curves
 from jaxhair.obstacles import Mesh, Obstacle
 from jaxhair.output import new_file
@@ -100,8 +101,6 @@ def check_drawing(path: str | os.PathLike[str], size: int) -> None:
     check.whole("size", size, least=16)
     if ending == ".mp4" and size % 2:
         raise ValueError(f"size is {size}; it must be even for an .mp4")
-    from jaxhair.figures import optional
-
     for module in ("matplotlib", "PIL", *(("imageio_ffmpeg",) if ending == ".mp4" else ())):
         optional(module)
 

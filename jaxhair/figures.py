@@ -1,6 +1,5 @@
 """Line drawings with matplotlib, apart from pyplot and its global state."""
 
-import importlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxhair import check
+from jaxhair.extras import optional
 from jaxhair.interpolation import bezier, used_points
 from jaxhair.output import new_file
 from jaxhair.raster import Array
@@ -22,16 +22,6 @@ def figure(width: float, height: float, **options: Any) -> tuple[Any, Any]:
     """A matplotlib figure [inch] and its canvas."""
     result = optional("matplotlib.figure").Figure((width, height), **options)
     return result, optional("matplotlib.backends.backend_agg").FigureCanvasAgg(result)
-
-
-def optional(module: str) -> Any:
-    """A module that only pictures need."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f'pictures need {module.partition(".")[0]}: pip install "jaxhair[pictures]"'
-        ) from error
 
 
 def check_suffix(path: PathLike, *allowed: str) -> str:

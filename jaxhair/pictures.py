@@ -16,7 +16,8 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from jaxhair import check, raster, shading
-from jaxhair.figures import PathLike, check_suffix, comparison, figure, optional
+from jaxhair.extras import optional
+from jaxhair.figures import PathLike, check_suffix, comparison, figure
 from jaxhair.interpolation import Interpolation, bezier, used_points
 from jaxhair.output import new_file
 from jaxhair.raster import Array, Camera, View

@@ -231,7 +231,7 @@ def test_missing_packages_are_named_before_the_work(monkeypatch: pytest.MonkeyPa
     def no_packages(name: str) -> Callable[[], None]:
         raise ImportError(name)
 
-    monkeypatch.setattr("jaxhair.figures.importlib.import_module", no_packages)
+    monkeypatch.setattr("jaxhair.extras.importlib.import_module", no_packages)
     with pytest.raises(ImportError, match=r"jaxhair\[pictures\]"):
         check_drawing("a.gif", 64)
     check_drawing("a.npz", 1)

@@ -9,7 +9,7 @@ import pytest
 import fitting
 import jaxhair as jh
 from fitting import measures
-from fitting.measured import from_text
+from fitting.measured import Seen, from_text
 from fitting.strands import curl_shape
 
 FREE: dict[str, fitting.Constraint] = {
@@ -272,6 +272,26 @@ def test_a_load_at_the_tip_draws_a_curl_out() -> None:
     drawn = {name: float(measures.extent(end.points)[0]) / 0.1 for name, end in ends(text).items()}
     assert drawn["dry"] < 0.85
     assert 0.93 < drawn["other"] < 1
+
+
+def test_a_small_load_at_the_tip_bends_a_level_hair_as_a_cantilever() -> None:
+    """Beside its own weight's w L^4 / (8 E I): m g L^3 / (3 E I), less the second order's share of
+    the slope^2. The first edge is held, and clamped in its middle."""
+    length, mass, edges = 10e-3, 2e-7, 40
+    edge = length / (edges - 0.5)
+    hair = jh.Strands.straight(
+        [[-edge / 2, 0, 0]], (1.0, 0, 0), length=edges * edge, points=edges + 1, dtype="float64"
+    )
+    fibre = jh.PhysicalFibre(peeling_rate=0.0)
+    drop = []
+    for load in (None, mass):
+        phases = tuple(Seen(True, load).phases([jh.Phase("seen", 1.0, jh.treatments.HANGING)]))
+        scene = jh.Scene(hair, fibre, phases=phases, solver=jh.Direct(newton_steps=2))
+        drop.append(-float(jax.jit(jh.run)(scene)["seen"].points[0, -1, 2]))
+    stiff = 3.89e9 * np.pi * 40e-6**4 / 4
+    weight = 9.8 * 1320 * np.pi * 40e-6**2
+    assert drop[0] == pytest.approx(weight * length**4 / 8 / stiff, rel=5e-3)
+    assert drop[1] - drop[0] == pytest.approx(mass * 9.8 * length**3 / 3 / stiff, rel=5e-3)
 
 
 @pytest.mark.parametrize(

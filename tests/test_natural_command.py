@@ -1,6 +1,7 @@
 """Natural strands from files on disk: what the command finds, writes, refuses and goes on from."""
 
 import json
+import platform
 import struct
 import sys
 from dataclasses import replace
@@ -14,6 +15,7 @@ from natural_head import FAULTS, STYLES, head
 import fitting
 import jaxhair as jh
 from fitting.__main__ import main
+from fitting.clamped import rooted
 from fitting.polylines import cleaned, evenly
 from jaxhair.checkpoints import Checkpoints
 
@@ -100,6 +102,7 @@ def test_a_data_file_in_its_own_unit_and_axes(
     assert main(["natural", str(path), *command.split(), str(folder)]) == 0
     printed = capsys.readouterr().out
     assert "no picture: pictures need matplotlib" in printed
+    assert report(folder)["versions"]["python"] == platform.python_version()
     assert "simulation" not in printed.split("strands fitted")[0]
     assert {p.name for p in folder.iterdir()} == {
         "natural.json", "natural.hair", "remembered.hair"
@@ -125,7 +128,7 @@ def test_hanging_and_unloaded_files_show_hydrogen_and_wear(tmp_path: Path) -> No
     fibre = replace(start.scene.fibre, peeling_rate=rates)
     ends = jh.run(replace(start.scene, bonds=jh.Bonds(influence), fibre=fibre))
     for name in ("natural", "unloaded"):
-        points = np.asarray(ends[name].points)
+        points = rooted(np.asarray(ends[name].points))
         jh.write_curves(tmp_path / f"{name}.hair", jh.Curves.from_list(points), unit=0.01)
     command = ["natural", str(tmp_path / "natural.hair"), "--points", "17", "--unit", "cm"]
     command += ["--unloaded", str(tmp_path / "unloaded.hair"), "--output", str(tmp_path / "out")]
@@ -138,6 +141,10 @@ def test_hanging_and_unloaded_files_show_hydrogen_and_wear(tmp_path: Path) -> No
     for row, rate in zip(rows, rates, strict=True):
         off = row["fibre.peeling_rate"] - rate
         assert abs(off) < max(3 * row["fibre.peeling_rate error"], 0.1 * rate)
+        assert row["residual_mm"] < 0.1
+        for name in ("bonds.influence[hydrogen]", "fibre.peeling_rate"):
+            low, high = row[f"{name} interval"]
+            assert low < row[name] < high
     assert len(jh.read_curves(tmp_path / "out" / "unloaded.hair").counts) == 3
 
 

@@ -18,6 +18,7 @@ from jaxhair.accuracy.measuring import Row, measure
 from jaxhair.accuracy.problem import PARAMETERS, Reference, reference
 from jaxhair.accuracy.stretch import Stretch, stretch
 from jaxhair.export import check_new
+from jaxhair.extras import optional
 from jaxhair.output import new_file
 
 FILES = ("accuracy.csv", "accuracy.json", "stretch.csv", "accuracy.png", "theory.png")
@@ -51,8 +52,6 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command; returns 0, or 130 if it was interrupted."""
-    from jaxhair.figures import optional
-
     check.whole("--strands", options.strands, least=1)
     plan = grid.plan(strands=options.strands, quick=options.quick)
     optional("matplotlib")

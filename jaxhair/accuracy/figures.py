@@ -9,7 +9,8 @@ from jaxhair.accuracy.measuring import Cost, Row
 from jaxhair.accuracy.problem import Problem, Reference
 from jaxhair.accuracy.stretch import Stretch
 from jaxhair.accuracy.table import pareto
-from jaxhair.figures import figure, optional
+from jaxhair.extras import optional
+from jaxhair.figures import figure
 from jaxhair.output import new_file
 
 COLORS = {"PositionBased": "#d1495b", "Compliant": "#dd9b30", "Direct": "#1f6f8b"}
