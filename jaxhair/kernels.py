@@ -8,18 +8,20 @@ third of the time that it took without (`tests/benchmarks/peers.py`), and compil
 
 How: a call with the frontend attribute `xla_cpu_small_call`, which XLA gives to small loops by
 itself, is compiled as a single function. Not everything works inside; `_fits` knows what does.
-What does not fit is left as it was, and so are other platforms, other versions of XLA than those
-tested, the transposed functions of reverse mode (XLA was seen to abort on those), and everything
-under the environment variable JAXHAIR_KERNELS=off.
+What does not fit is left as it was, and so are derivatives, for which XLA was seen to abort; other
+platforms; other versions of XLA than those tested; and everything under the environment variable
+JAXHAIR_KERNELS=off.
 """
 
+import math
 import os
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
 
 import jax
-from jax import Array
+import jax.numpy as jnp
+from jax import Array, lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxlib import version
@@ -55,17 +57,31 @@ _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 def one_kernel(function: F) -> F:
     """`function`, a pure one of pytrees of arrays, compiled on a CPU as one kernel if it fits.
 
-    Values and derivatives are those of the function, to rounding.
+    Values are those of the function, to rounding, and derivatives its own.
     """
-    compiled = jax.jit(function)
+
+    @wraps(function)
+    def with_touched(*arguments: Any) -> Any:
+        return function(*arguments), _touched(arguments)
+
+    compiled = jax.jit(with_touched)
 
     @wraps(function)
     def called(*arguments: Any) -> Any:
         if not used():
             return function(*arguments)
-        return jax.tree.map(_result_of_kernel, compiled(*arguments))
+        results, touched = compiled(*arguments)
+        leaves, structure = jax.tree.flatten(results)
+        return jax.tree.unflatten(structure, _results.bind(*leaves, *touched, count=len(leaves)))
 
     return called  # type: ignore[return-value]
+
+
+def _touched(arguments: Any) -> list[Array]:
+    """The first element of each array. XLA aborts where it finds that a kernel does not need an
+    argument, which a result in its own right prevents."""
+    arrays = [jnp.asarray(x) for x in jax.tree.leaves(arguments)]
+    return [lax.slice(x, (0,) * x.ndim, (1,) * x.ndim) for x in arrays if x.size]
 
 
 def used() -> bool:
@@ -74,40 +90,64 @@ def used() -> bool:
     return on and jax.default_backend() == "cpu" and version.__version__ in TESTED
 
 
-# An identity. To lower it is to mark the call that its value comes from.
-_identity = Primitive("result_of_kernel")
-_identity.def_impl(lambda x: x)
-_identity.def_abstract_eval(lambda x: x)
-ad.deflinear2(_identity, lambda cotangent, _: (cotangent,))
-batching.defvectorized(_identity)
-mlir.register_lowering(_identity, lambda context, x: [x], cacheable=False)
+# The results of a kernel, of those and its touched arguments. To lower it is to mark the call.
+_results = Primitive("results_of_kernel")
+_results.multiple_results = True
+_results.def_impl(lambda *x, count: x[:count])
+_results.def_abstract_eval(lambda *x, count: x[:count])
 
 
-def _result_of_kernel(x: Array) -> Array:
-    result: Array = _identity.bind(x)
-    return result
+def _jvp(primals: Any, tangents: Any, *, count: int) -> Any:
+    return list(primals[:count]), list(tangents[:count])
 
 
-def _mark(context: mlir.LoweringRuleContext, value: ir.Value[Any]) -> list[ir.Value[Any]]:
-    """Marks the call that made a value, if it fits into a kernel."""
-    call = value.owner
+ad.primitive_jvps[_results] = _jvp  # derivatives are not marked
+batching.primitive_batchers[_results] = lambda x, axes, count: (
+    _results.bind(*x, count=count),
+    axes[:count],
+)
+mlir.register_lowering(_results, lambda _, *x, count: x[:count], cacheable=False)
+
+
+def _mark(context: mlir.LoweringRuleContext, *values: ir.Value[Any], count: int) -> Any:
+    """Marks the call that made the values, if it fits into a kernel."""
+    call = values[0].owner
     if isinstance(call, ir.Operation | ir.OpView) and call.operation.name == "func.call":
         attributes = call.operation.attributes
-        if "mhlo.frontend_attributes" not in attributes and _fits(context.module_context, call):
+        if "mhlo.frontend_attributes" not in attributes and _fits(
+            context.module_context, call, True
+        ):
             marks: dict[str, ir.Attribute] = {
                 n: ir.StringAttr.get(x) for n, x in _ATTRIBUTES.items()
             }
             attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(marks)
-    return [value]
+    return values[:count]
 
 
-mlir.register_lowering(_identity, _mark, platform="cpu", cacheable=False)
+mlir.register_lowering(_results, _mark, platform="cpu", cacheable=False)
 
 
-def _fits(module: mlir.ModuleContext, call: Any) -> bool:
-    """Whether all in a call is known to work inside a kernel, on arrays small enough."""
+def _fits(module: mlir.ModuleContext, call: Any, touched: bool = False) -> bool:
+    """Whether all in a call is known to work inside a kernel, on arrays small enough.
+
+    touched: all arguments must be touched, as those of a kernel itself are.
+    """
     callee = ir.FlatSymbolRefAttr(call.operation.attributes["callee"]).value
-    return all(_works(module, op) for op in module.symbol_table[callee].regions[0].blocks[0])
+    body = module.symbol_table[callee].regions[0].blocks[0]
+    if touched and not all(_is_result(x) for x in body.arguments):
+        return False
+    return all(_works(module, op) for op in body)
+
+
+def _is_result(x: ir.Value[Any]) -> bool:
+    """Whether an argument, or a part of it, is a result of its function."""
+    users = [use.owner for use in x.uses]
+    through = ("stablehlo.slice", "stablehlo.reshape")
+    return any(
+        user.operation.name == "func.return"
+        or (user.operation.name in through and _is_result(user.operation.results[0]))
+        for user in users
+    )
 
 
 def _works(module: mlir.ModuleContext, op: Any) -> bool:
@@ -115,13 +155,10 @@ def _works(module: mlir.ModuleContext, op: Any) -> bool:
     if op.name == "func.call":
         return _fits(module, op)
     arrays = (*op.results, *op.operands) if op.name == "stablehlo.reduce" else op.results
-    if op.name not in INSIDE or any(_elements(x.type) > LARGEST for x in arrays):
+    if op.name not in INSIDE or not all(_sized(x) for x in arrays):
         return False
     return all(_works(module, o) for region in op.regions for block in region for o in block)
 
 
-def _elements(kind: ir.Type) -> int:
-    size = 1
-    for extent in ir.RankedTensorType(kind).shape:
-        size *= extent
-    return size
+def _sized(x: ir.Value[Any]) -> bool:
+    return math.prod(ir.RankedTensorType(x.type).shape) <= LARGEST

@@ -198,10 +198,10 @@ def _relative_springs(rod: Rod, dt: float) -> Array:
 # moved. `m` are the multipliers of edges and of inner points, `at` their constants.
 
 
-def _repeat(iteration: Callable[[Any], Any], x: Any, times: int) -> Any:
+def _repeat(iteration: Callable[[Any, Any], Any], x: Any, at: Any, times: int) -> Any:
     """x after `times` iterations; in reverse mode each is computed again instead of stored."""
     iteration = one_kernel(iteration)
-    body = jax.checkpoint(lambda x, _: (iteration(x), None), prevent_cse=False)
+    body = jax.checkpoint(lambda x, _: (iteration(x, at), None), prevent_cse=False)
     return lax.scan(body, x, None, length=times)[0]
 
 
@@ -213,7 +213,6 @@ def _sequential(
     In one sweep, since an inner point waits for nothing but the two edges beside it: behind each
     edge comes the inner point before it.
     """
-    of_first, of_others = _first_and_others(at[0])
 
     def next_edge(before: Any, here: Any) -> tuple[Any, Any]:
         p1, q1 = before
@@ -222,8 +221,9 @@ def _sequential(
         q1, q2, m_inner = inner(q1, q2, m_inner, at_inner)
         return (p2, q2), (p1, q1, m_edge, m_inner)
 
-    def iteration(x: Any) -> Any:
+    def iteration(x: Any, at: Any) -> Any:
         p, q, (of_edges, of_inner) = x
+        of_first, of_others = _first_and_others(at[0])
         first, others = _first_and_others(of_edges)
         root, p1, q1, first = edge(p[0], p[1], q[0], first, of_first)
         rows = (p[2:], q[1:], others, of_inner, of_others, at[1])
@@ -232,7 +232,7 @@ def _sequential(
         p, q = jnp.concatenate([root[None], p, tip[None]]), jnp.concatenate([q, last[None]])
         return p, q, (of_edges, of_inner)
 
-    return _repeat(iteration, (p, q, m), iterations)[:2]
+    return _repeat(iteration, (p, q, m), at, iterations)[:2]
 
 
 def _first_and_others(x: Any) -> tuple[Any, Any]:
@@ -248,10 +248,10 @@ def _red_black(
     Even and odd points live in arrays of their own during the iterations: strided slices inside
     them cost 1.7 times as much.
     """
-    (at_edges, at_inner) = (_halves(x) for x in at)
     start = _halves(p), _halves(q), tuple(_halves(x) for x in m)
 
-    def iteration(x: Any) -> Any:
+    def iteration(x: Any, at: Any) -> Any:
+        at_edges, at_inner = at
         (p0, p1), (q0, q1), ((e0, e1), (i0, i1)) = x
         p0, p1, q0, e0 = _edges(edge, p0, p1, q0, e0, at_edges[0])
         p1, p0_after, q1, e1 = _edges(edge, p1, p0[1:], q1, e1, at_edges[1])
@@ -261,7 +261,8 @@ def _red_black(
         q0 = jnp.concatenate([q0[:1], q0_after])
         return (p0, p1), (q0, q1), ((e0, e1), (i0, i1))
 
-    p2, q2, _ = _repeat(iteration, start, iterations)
+    halves = tuple(_halves(x) for x in at)
+    p2, q2, _ = _repeat(iteration, start, halves, iterations)
     return _woven(*p2), _woven(*q2)
 
 
@@ -274,7 +275,7 @@ def _woven(even: Array, odd: Array) -> Array:
     """The rows even[0], odd[0], even[1], ...: the inverse of `_halves`."""
     n = odd.shape[0]
     pairs = jnp.stack([even[:n], odd], axis=1).reshape(2 * n, *even.shape[1:])
-    return jnp.concatenate([pairs, even[n:]])
+    return pairs if len(even) == n else jnp.concatenate([pairs, even[n:]])
 
 
 def _edges(edge: Any, first: Array, second: Array, q: Array, m: Any, at: Any) -> Any:
@@ -282,11 +283,17 @@ def _edges(edge: Any, first: Array, second: Array, q: Array, m: Any, at: Any) ->
     no partner, stays."""
     n = q.shape[0]
     a, b, q, m = edge(first[:n], second[:n], q, m, at)
-    return jnp.concatenate([a, first[n:]]), jnp.concatenate([b, second[n:]]), q, m
+    return _followed(a, first), _followed(b, second), q, m
 
 
 def _inner(inner: Any, first: Array, second: Array, m: Any, at: Any) -> Any:
     """Inner points between the rows of `first` and those of `second`."""
     n = at[0].shape[0]
     a, b, m = inner(first[:n], second[:n], m, at)
-    return jnp.concatenate([a, first[n:]]), jnp.concatenate([b, second[n:]]), m
+    return _followed(a, first), _followed(b, second), m
+
+
+def _followed(rows: Array, all_rows: Array) -> Array:
+    """Rows, and behind them those of another array that they do not replace."""
+    n = rows.shape[0]
+    return rows if n == all_rows.shape[0] else jnp.concatenate([rows, all_rows[n:]])
