@@ -22,8 +22,12 @@ if TYPE_CHECKING:
     from jaxhair.simulate import Setup
     from jaxhair.strands import State
 
-LANES, MOST_LANES = 16, 256
-"""Strands of a tile: a multiple of the first, which fills vector registers, and at most so many."""
+LANES = 16
+"""Strands of a tile are a multiple of it, which fills vector registers."""
+
+FEWEST, MOST, POINTS = 64, 128, 9600
+"""Strands of a tile, and their points. More do not stay in cache; fewer waste time on starting
+kernels. Measured: see `tests/benchmarks/devices.py`."""
 
 
 def couples(effects: Iterable[Effect]) -> Effect | None:
@@ -54,12 +58,15 @@ def checked_devices(scene: "Scene", devices: int) -> int:
 
 
 def tiling(strands: int, points: int) -> tuple[int, int]:
-    """How many tiles, and strands in each, the last one filled up.
+    """How many tiles, and strands in each, of which the last repeats some.
 
-    As large as lets the largest arrays, those of remembered shapes, fit into a kernel.
+    One where the largest arrays, of remembered shapes, fit into one kernel, and where a tile's
+    strands would be too few because they are long.
     """
-    most = LARGEST // (12 * points) // LANES * LANES
-    tiles = -(-strands // min(max(most, LANES), MOST_LANES))
+    most = min(POINTS // points // LANES * LANES, MOST)
+    if strands * 12 * points <= LARGEST or most < FEWEST:
+        return 1, strands
+    tiles = -(-strands // most)
     return tiles, -(-strands // (LANES * tiles)) * LANES
 
 
@@ -78,13 +85,9 @@ def spread(
     strands = state.positions.shape[-1]
     devices = min(setup.devices, -(-strands // LANES))
     if devices == 1:
-        return _by_tiles(advanced, *arguments)
+        return _by_tiles(advanced, setup, state, *shared)
+    leaves, tree, own = _flat(arguments, strands)
     size = -(-strands // devices) * devices
-    spec = PartitionSpec
-    own = [_of_strands(x, strands) for x in jax.tree.leaves(arguments)]
-    leaves, tree = jax.tree.flatten(arguments)
-    padded = [_padded(x, size) if o else x for x, o in zip(leaves, own, strict=True)]
-    last = [spec(*[None] * (np.ndim(x) - 1), "strands") for x in leaves]
 
     def share(*leaves: Array) -> "State":
         return _by_tiles(advanced, *jax.tree.unflatten(tree, leaves))
@@ -92,11 +95,23 @@ def spread(
     found = jax.shard_map(
         share,
         mesh=Mesh(np.array(jax.local_devices()[:devices]), ("strands",)),
-        in_specs=tuple(s if o else spec() for s, o in zip(last, own, strict=True)),
-        out_specs=jax.tree.map(lambda x: spec(*[None] * (x.ndim - 1), "strands"), state),
+        in_specs=tuple(_cut_last(x, cut) for x, cut in zip(leaves, own, strict=True)),
+        out_specs=jax.tree.map(lambda x: _cut_last(x, True), state),
         check_vma=False,
-    )(*padded)
+    )(*(_padded(x, size) if cut else x for x, cut in zip(leaves, own, strict=True)))
     return jax.tree.map(lambda x: x[..., :strands], found)
+
+
+def _cut_last(x: Any, cut: bool) -> Any:
+    """How an array lies on the devices: cut along its last axis, or whole on each."""
+    axes = [None] * (np.ndim(x) - 1) + ["strands"] if cut else []
+    return PartitionSpec(*axes)  # type: ignore[no-untyped-call]
+
+
+def _flat(arguments: Any, strands: int) -> tuple[list[Any], Any, list[bool]]:
+    """Leaves, their structure, and which of them have strands on their last axis."""
+    leaves, tree = jax.tree.flatten(arguments)
+    return leaves, tree, [np.shape(x)[-1:] == (strands,) for x in leaves]
 
 
 def _by_tiles(
@@ -106,21 +121,16 @@ def _by_tiles(
     tiles, lanes = tiling(strands, points)
     if tiles == 1 or jax.default_backend() != "cpu":
         return advanced(setup, state, *shared)
-    leaves, tree = jax.tree.flatten((setup, state, *shared))
-    own = [_of_strands(x, strands) for x in leaves]
+    leaves, tree, own = _flat((setup, state, *shared), strands)
 
     def one(tile: Sequence[Array]) -> "State":
-        cut = iter(tile)
-        each = [next(cut) if o else x for x, o in zip(leaves, own, strict=True)]
+        parts = iter(tile)
+        each = [next(parts) if cut else x for x, cut in zip(leaves, own, strict=True)]
         return advanced(*jax.tree.unflatten(tree, each))
 
     size = tiles * lanes
-    cut = [_cut(_padded(x, size), tiles) for x, o in zip(leaves, own, strict=True) if o]
+    cut = [_cut(_padded(x, size), tiles) for x, cut in zip(leaves, own, strict=True) if cut]
     return jax.tree.map(lambda x: _joined(x)[..., :strands], lax.map(one, cut))
-
-
-def _of_strands(x: Any, strands: int) -> bool:
-    return np.shape(x)[-1:] == (strands,)
 
 
 def _padded(x: Array, size: int) -> Array:
