@@ -12,7 +12,6 @@ import numpy as np
 from jax import Array, lax
 
 from jaxhair import check, diagnosis, tiles
-from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
@@ -182,11 +181,9 @@ def _frame(
     share one compiled program; it is a `while` loop, which has no reverse mode and needs none here.
     """
 
-    whole_step = one_kernel(step)
-
     def advanced(setup: Setup, state: State, first: Array, steps: Array) -> State:
         def one(number: Array, state: State) -> State:
-            return whole_step(setup, state, number.astype(state.positions.dtype) * setup.dt)
+            return step(setup, state, number.astype(state.positions.dtype) * setup.dt)
 
         return lax.fori_loop(first, first + steps, one, state)
 
