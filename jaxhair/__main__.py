@@ -178,7 +178,7 @@ def _split_cpu(devices: int) -> None:
     """Lets the CPU count as several devices, unless JAX has started or was told already."""
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         with suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", devices)
+            jax.config.update("jax_num_cpu_devices", devices)  # type: ignore[no-untyped-call]
 
 
 def _simulate(options: argparse.Namespace) -> int:

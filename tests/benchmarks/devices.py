@@ -21,7 +21,7 @@ SIZES = ((200, 9), (10_000, 9), (1_000, 100))
 STRANDS = (100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POINTS = (5, 9, 17, 33, 65, 129, 257, 500)
 EFFECTS = (jh.Gravity(), jh.Drag(2.8), jh.Hold())
-SECONDS = 3.0  # of each comparison
+SECONDS = 4.0  # of each comparison
 
 
 def steps(strands: int, points: int, devices: int, whole: bool) -> tuple[Callable[[], Any], int]:
