@@ -7,7 +7,8 @@ dataclass with `jaxhair.pytree` that derives from one or more of these classes.
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from jax import Array
 
@@ -34,6 +35,42 @@ class VelocityEffect(Effect):
     @abstractmethod
     def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
         """Change of velocity [m/s] over a step, shape (points, 3, strands)."""
+
+
+class RememberingEffect(VelocityEffect):
+    """Keeps from step to step what it can make anew from any state: lists of neighbours.
+
+    A memory saves time and changes no result but by rounding. It belongs to the loop over steps,
+    which starts without one, and not to a State.
+    """
+
+    @abstractmethod
+    def remembered(self, rod: "Rod", state: "State", memory: Any = None) -> Any:
+        """The memory that serves in a state: the one given, if it still does, or a new one."""
+
+    @abstractmethod
+    def recalled_change(self, rod: "Rod", state: "State", dt: float, memory: Any) -> Array:
+        """The change of velocity [m/s] over a step, by a memory that serves in its state."""
+
+    def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
+        """The change of velocity [m/s] over a step, without a memory from before."""
+        return self.recalled_change(rod, state, dt, self.remembered(rod, state))
+
+    def fault(self, rod: "Rod", state: "State") -> str:
+        """What of the effect does not go with a state, and what to change; "" if nothing."""
+        return ""
+
+
+@dataclass(frozen=True)
+class Recalled(VelocityEffect):
+    """An effect together with its memory."""
+
+    effect: RememberingEffect
+    memory: Any
+
+    def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
+        """The change of velocity [m/s] over a step, by the memory."""
+        return self.effect.recalled_change(rod, state, dt, self.memory)
 
 
 class PositionEffect(Effect):

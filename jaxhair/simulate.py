@@ -17,6 +17,8 @@ from jaxhair.effects import (
     HoldingEffect,
     PoseEffect,
     PositionEffect,
+    Recalled,
+    RememberingEffect,
     StiffnessEffect,
     VelocityEffect,
     of_kind,
@@ -70,6 +72,30 @@ def step(setup: Setup, state: State, time: Array) -> State:
         q = state.orientations
         state = bond.reformed(state, rises, rods.darboux(q[:-1], q[1:]))
     return state
+
+
+def remembering_step(
+    setup: Setup, state: State, memories: tuple[Any, ...] | None, time: Array
+) -> tuple[State, tuple[Any, ...]]:
+    """One time step with the memories of effects that have one, None before the first; with those
+    that served in it."""
+    memories = remembered(setup, state, memories)
+    left = iter(memories)
+    effects = tuple(
+        Recalled(e, next(left)) if isinstance(e, RememberingEffect) else e for e in setup.effects
+    )
+    return step(replace(setup, effects=effects), state, time), memories
+
+
+def remembered(
+    setup: Setup, state: State, memories: tuple[Any, ...] | None = None
+) -> tuple[Any, ...]:
+    """The memories that serve in a state, of the effects that have one, in their order."""
+    effects = of_kind(setup.effects, RememberingEffect)
+    before = (None,) * len(effects) if memories is None else memories
+    return tuple(
+        e.remembered(setup.rod, state, memory) for e, memory in zip(effects, before, strict=True)
+    )
 
 
 def moved(
@@ -168,22 +194,25 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
     computed a second and third time instead.
     """
 
-    def one(state: State, number: Array) -> tuple[State, None]:
-        return step(setup, state, number.astype(state.positions.dtype) * setup.dt), None
+    def one(carry: Any, number: Array) -> tuple[Any, None]:
+        state, memories = carry
+        time = number.astype(state.positions.dtype) * setup.dt
+        return remembering_step(setup, state, memories, time), None
 
-    def many(state: State, numbers: Array) -> tuple[State, None]:
-        return lax.scan(jax.checkpoint(one, prevent_cse=False), state, numbers)
+    def many(carry: Any, numbers: Array) -> tuple[Any, None]:
+        return lax.scan(jax.checkpoint(one, prevent_cse=False), carry, numbers)
 
     if steps == 1:  # such as a phase of a treatment; a third of the time to compile
-        return one(state, jnp.asarray(first))[0]
+        return one((state, None), jnp.asarray(first))[0][0]
     numbers = first + jnp.arange(steps)
     inner = _near_square_root(steps)
     outer = steps // inner
     blocks = numbers[: outer * inner].reshape(outer, inner)
-    state, _ = lax.scan(jax.checkpoint(many, prevent_cse=False), state, blocks)
+    carry = state, remembered(setup, state)
+    carry, _ = lax.scan(jax.checkpoint(many, prevent_cse=False), carry, blocks)
     if outer * inner < steps:
-        state, _ = many(state, numbers[outer * inner :])
-    return state
+        carry, _ = many(carry, numbers[outer * inner :])
+    return carry[0]
 
 
 def _near_square_root(steps: int) -> int:
