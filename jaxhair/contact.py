@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -9,15 +10,17 @@ from jax import Array, lax
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import RememberingEffect
-from jaxhair.neighbours import Pairs, near_pairs
+from jaxhair.neighbours import near_pairs
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.strands import State
 
+CHUNK = 2**15
+"""Pairs whose pushes are computed together: what fits into a processor's cache."""
 FULL = 0.8
 """Share of the room in lists that a new skin is meant to fill."""
 LEAST = 1e-3
-"""Skins below this share of the first one tried are taken as none."""
+"""Skins below this share of an edge's length are taken as none."""
 
 
 @pytree
@@ -25,14 +28,17 @@ class Lists:
     """Pairs of points and edges that may touch, for as long as hair moves little.
 
     Arguments:
-        pairs: those nearer than two radii and the skin when the lists were made.
-        skin: by how much hairs may come nearer since [m], shape (); below 0 where there was no room
-            even for what touched.
+        points, edges: of `neighbours.Pairs` that were nearer than two radii and the skin when the
+            lists were made, shape (chunks, pairs of a chunk). count: of such pairs, shape ().
+        skin: by how much hairs may have come nearer since [m], shape (); below 0 where there was no
+            room even for what touched.
         positions: when the lists were made [m], shape (points, 3, strands).
         builds: how often lists were made, shape ().
     """
 
-    pairs: Pairs
+    points: Array
+    edges: Array
+    count: Array
     skin: Array
     positions: Array
     builds: Array
@@ -43,6 +49,11 @@ class Lists:
         # no two points have moved further against each other than the diagonal of all moves' box
         box = jnp.max(moved, axis=(0, 2)) - jnp.min(moved, axis=(0, 2))
         return jnp.sqrt(jnp.sum(box**2)) <= self.skin
+
+    def fitting(self) -> Array:
+        """By how much a skin may grow, or must shrink: pairs grow with about its square."""
+        count = jnp.maximum(self.count, 1).astype(self.skin.dtype)
+        return jnp.sqrt(FULL * self.points.size / count)
 
 
 @pytree
@@ -83,10 +94,17 @@ class HairContact(RememberingEffect):
         """
         x = _flat(state.positions)
         size, strands = x.shape[1], state.positions.shape[2]
-        point, start = memory.pairs.points, jnp.minimum(memory.pairs.edges, size - strands - 1)
-        p, start, end = (x.at[:, at].get(mode="clip") for at in (point, start, start + strands))
-        push = jnp.where(point < size, self._push(p, start, end), 0)
-        total = [jnp.zeros_like(x[0]).at[point].add(one, mode="drop") for one in push]
+
+        def with_chunk(total: tuple[Array, ...], pairs: tuple[Array, Array]) -> tuple[Any, None]:
+            at, edge = pairs
+            p, start, end = (x.at[:, n].get(mode="clip") for n in (at, edge, edge + strands))
+            push = jnp.where(at < size, self._push(p, start, end), 0)
+            return tuple(
+                t.at[at].add(one, mode="drop") for t, one in zip(total, push, strict=True)
+            ), None
+
+        body = jax.checkpoint(with_chunk, prevent_cse=False)
+        total, _ = lax.scan(body, (jnp.zeros_like(x[0]),) * 3, (memory.points, memory.edges))
         holds = memory.hold(lax.stop_gradient(state.positions))
         pushed = self.strength * dt * jnp.where(holds, jnp.stack(total), jnp.nan)
         pushed = jnp.moveaxis(pushed.reshape(3, -1, strands), 0, 1)
@@ -97,7 +115,7 @@ class HairContact(RememberingEffect):
         along = end - start
         square = quat.dot(along, along)
         place = jnp.clip(quat.dot(p - start, along) / jnp.where(square == 0, 1, square), 0, 1)
-        apart = p - (start + place * along)
+        apart = (p - start) - place * along  # of small numbers: where hair is has no rounding here
         rounding = 4 * np.finfo(p.dtype).eps * jnp.max(jnp.abs(p), axis=-2, keepdims=True)
         nowhere = jnp.all(jnp.abs(apart) <= rounding, axis=-2, keepdims=True)  # NaN is not
         apart = jnp.where(nowhere, 0, apart)
@@ -108,61 +126,57 @@ class HairContact(RememberingEffect):
         """The lists as they are, if they hold, or new ones."""
         # which edges are near is no number: no derivative goes through it
         rod, x, radius = lax.stop_gradient((rod, state.positions, jnp.asarray(self.radius)))
-        widest = jnp.mean(rod.lengths, where=rod.lengths > 0)  # boxes of edges are no smaller
+        edge = jnp.mean(rod.lengths, where=rod.lengths > 0)
         if memory is None:
-            return self._listed(rod, x, radius, widest, jnp.int32(1))
+            return self._listed(rod, x, radius, edge, edge / 4, jnp.int32(1))
 
         def anew() -> Lists:
-            skin = memory.skin * jnp.minimum(_fitting(memory.pairs), 1.5).astype(x.dtype)
-            skin = jnp.clip(skin, LEAST * widest, widest)
-            return self._listed(rod, x, radius, skin, memory.builds + 1)
+            skin = memory.skin * jnp.minimum(memory.fitting(), 1.5)
+            skin = jnp.clip(skin, LEAST * edge, edge / 2)  # boxes around edges are no smaller
+            return self._listed(rod, x, radius, edge, skin, memory.builds + 1)
 
         return lax.cond(memory.hold(x), lambda: memory, anew)
 
-    def _listed(self, rod: Rod, x: Array, radius: Array, skin: Array, builds: Array) -> Lists:
+    def _listed(
+        self, rod: Rod, x: Array, radius: Array, edge: Array, skin: Array, builds: Array
+    ) -> Lists:
         """New lists with a skin that is the one given, or as much smaller as there is room for."""
         points, _, strands = x.shape
         starts, ends = x, jnp.concatenate([x[1:], jnp.full_like(x[:1], jnp.nan)])
         if rod.ragged:
-            edges = rod.edge_exists()
+            exists = rod.edge_exists()
             starts = jnp.where(rod.point_exists(), starts, jnp.nan)
-            ends = jnp.where(jnp.concatenate([edges, ~edges[:1]]), ends, jnp.nan)
+            ends = jnp.where(jnp.concatenate([exists, ~exists[:1]]), ends, jnp.nan)
         of_strands = jnp.tile(jnp.arange(strands, dtype=jnp.int32), points)
         rounding = 32 * np.finfo(x.dtype).eps * jnp.max(jnp.abs(x))
         room = points * strands * min(self.capacity, (points - 1) * max(strands - 1, 1))
-        least = LEAST * skin
+        chunks = -(-room // CHUNK)
+        room = chunks * -(-room // chunks)
 
-        def tried(skin: Array) -> tuple[Array, Pairs]:
+        def tried(skin: Array) -> Lists:
             reach = 2 * radius + skin + rounding
-            return skin, near_pairs(_flat(starts), _flat(ends), of_strands, reach, room)
+            pairs = near_pairs(_flat(starts), _flat(ends), of_strands, reach, room)
+            at, edges = (numbers.reshape(chunks, -1) for numbers in pairs[:2])
+            skin = jnp.where((pairs.count > room) & (skin == 0), -1, skin)
+            return Lists(at, edges, pairs.count, skin, x, builds)
 
-        def smaller(last: tuple[Array, Pairs]) -> tuple[Array, Pairs]:
-            skin = last[0] * jnp.minimum(_fitting(last[1]), 0.7).astype(x.dtype)
-            return tried(jnp.where(skin < least, 0, skin))
+        def smaller(last: Lists) -> Lists:
+            skin = last.skin * jnp.minimum(last.fitting(), 0.7)
+            return tried(jnp.where(skin < LEAST * edge, 0, skin))
 
-        def too_many(last: tuple[Array, Pairs]) -> Array:
-            return (last[1].count > room) & (last[0] > 0)
-
-        skin, pairs = lax.while_loop(too_many, smaller, tried(skin))
-        return Lists(pairs, jnp.where(pairs.count > room, -1, skin), x, builds)
+        return lax.while_loop(lambda last: (last.count > room) & (last.skin > 0), smaller, tried(skin))
 
     def fault(self, rod: Rod, state: State) -> str:
         """That more edges touch points than there is room for."""
         lists = self.remembered(rod, state)
         if lists.skin >= 0 or not np.isfinite(state.positions).all():
             return ""
-        mean = int(lists.pairs.count) / state.positions[:, 0].size
+        mean = int(lists.count) / state.positions[:, 0].size
         return (
             f"finds {mean:.1f} edges within two radii of a point, in the mean, and "
             f"HairContact.capacity is {self.capacity}; set it to {int(mean) + 1} or more, or take "
             "a smaller radius"
         )
-
-
-def _fitting(pairs: Pairs) -> Array:
-    """By how much a skin may grow, or must shrink: pairs grow with about its square."""
-    room = FULL * len(pairs.points)
-    return jnp.sqrt(room / jnp.maximum(pairs.count, 1).astype(jnp.float32))
 
 
 def _flat(x: Array) -> Array:

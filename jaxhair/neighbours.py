@@ -14,7 +14,7 @@ BLOCK = 32
 """Points in a block, and blocks in a group: the bits of a word, one for each edge of a block."""
 TILES = 64
 """Pairs of blocks whose distances are computed together."""
-ROOM = 2048
+ROOM = 512
 """Pairs of a point and an edge that are listed together."""
 
 
@@ -53,6 +53,9 @@ def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacit
     p, q = blocks(starts, jnp.nan), blocks(ends, jnp.nan)
     own = blocks(strands[None], -1)[0]
     of_points, of_edges = _box(p, p), _box(p, q)
+    along = q - p
+    square = jnp.sum(along**2, axis=0, keepdims=True)
+    across = along / jnp.where(square == 0, 1, square)
     pairs_of_groups, many_groups = _listed(_near(_whole(of_points), _whole(of_edges), reach))
 
     def of_groups(number: Array, found: Pairs) -> Pairs:
@@ -66,7 +69,11 @@ def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacit
             number = done + jnp.arange(TILES, dtype=done.dtype)
             a, b = jnp.divmod(tiles[jnp.minimum(number, BLOCK**2 - 1)], BLOCK)
             a, b = first * BLOCK + a, second * BLOCK + b
-            words = _near_edges(p[:, a], own[a], p[:, b], q[:, b], own[b], reach)
+            apart = p[:, a, None] - p[:, b, :, None]  # (3, tiles, edges, points)
+            place = jnp.clip(jnp.sum(apart * across[:, b, :, None], axis=0, keepdims=True), 0, 1)
+            square = jnp.sum((apart - place * along[:, b, :, None]) ** 2, axis=0)
+            near = (square < reach**2) & (own[a, None] != own[b, :, None])
+            words = _words(near)
             words = jnp.where((number < many)[:, None], words, 0)
             return done + TILES, _with(found, words, a, b, order)
 
@@ -127,22 +134,10 @@ def _near(a: Box, b: Box, reach: Array) -> Array:
     return jnp.sum(jnp.maximum(gap, 0) ** 2, axis=0) < reach**2
 
 
-def _near_edges(p: Array, of: Array, start: Array, end: Array, other: Array, reach: Array) -> Array:
-    """Which edges are near each point, as bits, shape (tiles, points of a block).
-
-    Arguments:
-        p: points, shape (3, tiles, BLOCK). of: their strands, shape (tiles, BLOCK).
-        start, end, other: of the edges, likewise.
-    """
-    start, along = start[..., None], (end - start)[..., None]
-    square = jnp.sum(along**2, axis=0, keepdims=True)
-    apart = p[:, :, None] - start  # (3, tiles, edges, points)
-    place = jnp.sum(apart * along, axis=0, keepdims=True) / jnp.where(square == 0, 1, square)
-    square = jnp.sum((apart - jnp.clip(place, 0, 1) * along) ** 2, axis=0)
-    near = (square < reach**2) & (of[:, None] != other[:, :, None])
+def _words(true: Array) -> Array:
+    """What is true of 32 edges in the bits of a word: (tiles, edges, points) to (tiles, points)."""
     bits = jnp.uint32(1) << jnp.arange(BLOCK, dtype=jnp.uint32)
-    words = jnp.where(near, bits[None, :, None], jnp.uint32(0))
-    return jnp.sum(words, axis=1, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(true, bits[None, :, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
 def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array) -> Pairs:
