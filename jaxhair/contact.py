@@ -1,5 +1,6 @@
 """Hair against hair: a penalty that pushes apart what comes closer than two radii."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -122,53 +123,26 @@ class HairContact(RememberingEffect):
         depth = jnp.maximum(1 - quat.safe_norm(apart) / (2 * self.radius), 0)
         return depth * quat.unit(apart)
 
-    def remembered(self, rod: Rod, state: State, memory: Lists | None = None) -> Lists:
+    def blank(self, rod: Rod, state: State) -> Lists:
+        """Lists that hold nowhere."""
+        points, _, strands = state.positions.shape
+        room = points * strands * min(self.capacity, (points - 1) * max(strands - 1, 1))
+        chunks = -(-room // CHUNK)
+        none = jnp.full((chunks, -(-room // chunks)), points * strands, jnp.int32)
+        x = lax.stop_gradient(state.positions)
+        return Lists(
+            none, none, jnp.int32(none.size + 1), -jnp.ones_like(x[0, 0, 0]), x, jnp.int32(0)
+        )
+
+    def remembered(self, rod: Rod, state: State, memory: Lists) -> Lists:
         """The lists as they are, if they hold, or new ones."""
         # which edges are near is no number: no derivative goes through it
         rod, x, radius = lax.stop_gradient((rod, state.positions, jnp.asarray(self.radius)))
-        edge = jnp.mean(rod.lengths, where=rod.lengths > 0)
-        if memory is None:
-            return self._listed(rod, x, radius, edge, edge / 4, jnp.int32(1))
-
-        def anew() -> Lists:
-            skin = memory.skin * jnp.minimum(memory.fitting(), 1.5)
-            skin = jnp.clip(skin, LEAST * edge, edge / 2)  # boxes around edges are no smaller
-            return self._listed(rod, x, radius, edge, skin, memory.builds + 1)
-
-        return lax.cond(memory.hold(x), lambda: memory, anew)
-
-    def _listed(
-        self, rod: Rod, x: Array, radius: Array, edge: Array, skin: Array, builds: Array
-    ) -> Lists:
-        """New lists with a skin that is the one given, or as much smaller as there is room for."""
-        points, _, strands = x.shape
-        starts, ends = x, jnp.concatenate([x[1:], jnp.full_like(x[:1], jnp.nan)])
-        if rod.ragged:
-            exists = rod.edge_exists()
-            starts = jnp.where(rod.point_exists(), starts, jnp.nan)
-            ends = jnp.where(jnp.concatenate([exists, ~exists[:1]]), ends, jnp.nan)
-        of_strands = jnp.tile(jnp.arange(strands, dtype=jnp.int32), points)
-        rounding = 32 * np.finfo(x.dtype).eps * jnp.max(jnp.abs(x))
-        room = points * strands * min(self.capacity, (points - 1) * max(strands - 1, 1))
-        chunks = -(-room // CHUNK)
-        room = chunks * -(-room // chunks)
-
-        def tried(skin: Array) -> Lists:
-            reach = 2 * radius + skin + rounding
-            pairs = near_pairs(_flat(starts), _flat(ends), of_strands, reach, room)
-            at, edges = (numbers.reshape(chunks, -1) for numbers in pairs[:2])
-            skin = jnp.where((pairs.count > room) & (skin == 0), -1, skin)
-            return Lists(at, edges, pairs.count, skin, x, builds)
-
-        def smaller(last: Lists) -> Lists:
-            skin = last.skin * jnp.minimum(last.fitting(), 0.7)
-            return tried(jnp.where(skin < LEAST * edge, 0, skin))
-
-        return lax.while_loop(lambda last: (last.count > room) & (last.skin > 0), smaller, tried(skin))
+        return lax.cond(memory.hold(x), lambda: memory, lambda: _renewed(memory, rod, x, radius))
 
     def fault(self, rod: Rod, state: State) -> str:
         """That more edges touch points than there is room for."""
-        lists = self.remembered(rod, state)
+        lists = self.remembered(rod, state, self.blank(rod, state))
         if lists.skin >= 0 or not np.isfinite(state.positions).all():
             return ""
         mean = int(lists.count) / state.positions[:, 0].size
@@ -177,6 +151,39 @@ class HairContact(RememberingEffect):
             f"HairContact.capacity is {self.capacity}; set it to {int(mean) + 1} or more, or take "
             "a smaller radius"
         )
+
+
+def _renewed(memory: Lists, rod: Rod, x: Array, radius: Array) -> Lists:
+    """New lists, with the widest skin that there is room for, as far as the last skin tells."""
+    points, _, strands = x.shape
+    starts, ends = x, jnp.concatenate([x[1:], jnp.full_like(x[:1], jnp.nan)])
+    if rod.ragged:
+        exists = rod.edge_exists()
+        starts = jnp.where(rod.point_exists(), starts, jnp.nan)
+        ends = jnp.where(jnp.concatenate([exists, ~exists[:1]]), ends, jnp.nan)
+    of_strands = jnp.tile(jnp.arange(strands, dtype=jnp.int32), points)
+    rounding = 32 * np.finfo(x.dtype).eps * jnp.max(jnp.abs(x))
+    room, builds = memory.points.size, memory.builds + 1
+
+    def tried(carry: tuple[Array, Lists]) -> tuple[Array, Lists]:
+        skin, _ = carry
+        reach = 2 * radius + skin + rounding
+        pairs = near_pairs(_flat(starts), _flat(ends), of_strands, reach, room)
+        at, edges = (numbers.reshape(memory.points.shape) for numbers in pairs[:2])
+        none = (pairs.number > room) & (skin == 0)
+        lists = Lists(at, edges, pairs.number, jnp.where(none, -1, skin), x, builds)
+        smaller = skin * jnp.minimum(lists.fitting(), 0.7)
+        return jnp.where(smaller < LEAST * edge, 0, smaller), lists
+
+    def too_many(carry: tuple[Array, Lists]) -> Array:
+        return (carry[1].count > room) & (carry[1].skin >= 0)
+
+    edge = jnp.mean(rod.lengths, where=rod.lengths > 0)
+    skin = memory.skin * jnp.minimum(memory.fitting(), 1.5)
+    skin = jnp.clip(skin, LEAST * edge, edge / 2)  # boxes around edges are no smaller
+    skin = jnp.where(memory.builds == 0, edge / 4, skin)
+    untried = replace(memory, count=jnp.int32(room + 1), skin=jnp.zeros_like(skin))
+    return lax.while_loop(too_many, tried, (skin, untried))[1]
 
 
 def _flat(x: Array) -> Array:

@@ -150,7 +150,9 @@ def _blame(
         overflow = bool(bad.any())
         if overflow and culprit is not None:
             place = _place(_by_point(bad, len(state.positions)))
-            if isinstance(culprit, RememberingEffect) and (fault := culprit.fault(setup.rod, start)):
+            if isinstance(culprit, RememberingEffect) and (
+                fault := culprit.fault(setup.rod, start)
+            ):
                 return Cause(place, f"{_name(culprit)} {fault}")
             fault = "gives values that are not finite there"
             return Cause(place, f"{_name(culprit)} {fault}; {_advice(culprit)}")

@@ -45,7 +45,11 @@ class RememberingEffect(VelocityEffect):
     """
 
     @abstractmethod
-    def remembered(self, rod: "Rod", state: "State", memory: Any = None) -> Any:
+    def blank(self, rod: "Rod", state: "State") -> Any:
+        """The memory before the first step, which serves in no state; same shapes as any other."""
+
+    @abstractmethod
+    def remembered(self, rod: "Rod", state: "State", memory: Any) -> Any:
         """The memory that serves in a state: the one given, if it still does, or a new one."""
 
     @abstractmethod
@@ -54,7 +58,8 @@ class RememberingEffect(VelocityEffect):
 
     def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
         """The change of velocity [m/s] over a step, without a memory from before."""
-        return self.recalled_change(rod, state, dt, self.remembered(rod, state))
+        memory = self.remembered(rod, state, self.blank(rod, state))
+        return self.recalled_change(rod, state, dt, memory)
 
     def fault(self, rod: "Rod", state: "State") -> str:
         """What of the effect does not go with a state, and what to change; "" if nothing."""

@@ -23,12 +23,12 @@ class Pairs(NamedTuple):
 
     points, edges: numbers of the points and of the points where the edges start, shape (capacity,);
         behind the last pair, the number of points, which is no point.
-    count: of pairs that are near, also of those that found no room, shape ().
+    number: of pairs that are near, also of those that found no room, shape ().
     """
 
     points: Array
     edges: Array
-    count: Array
+    number: Array
 
 
 def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacity: int) -> Pairs:
@@ -83,9 +83,9 @@ def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacit
     none = jnp.full(capacity + ROOM, size, jnp.int32)
     found = Pairs(none, none, jnp.zeros((), jnp.int32))
     found = lax.fori_loop(0, many_groups, of_groups, found)
-    inside = jnp.arange(capacity, dtype=jnp.int32) < found.count
+    inside = jnp.arange(capacity, dtype=jnp.int32) < found.number
     points, edges = (jnp.where(inside, x[:capacity], size) for x in found[:2])
-    return Pairs(points, edges, found.count)
+    return Pairs(points, edges, found.number)
 
 
 def _listed(true: Array) -> tuple[Array, Array]:
@@ -155,14 +155,14 @@ def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array) -> Pairs
         before = ends[word] - lax.population_count(words[word]).astype(jnp.int32)
         tile, point = jnp.divmod(word, BLOCK)
         edge = _bit(words[word], number - before)
-        at = jnp.minimum(found.count + done, capacity)
+        at = jnp.minimum(found.number + done, capacity)
         points = lax.dynamic_update_slice(points, order[a[tile] * BLOCK + point], (at,))
         edges = lax.dynamic_update_slice(edges, order[b[tile] * BLOCK + edge], (at,))
         return done + ROOM, points, edges
 
     carry = jnp.zeros((), jnp.int32), found.points, found.edges
     _, points, edges = lax.while_loop(lambda carry: carry[0] < many, some, carry)
-    return Pairs(points, edges, found.count + many)
+    return Pairs(points, edges, found.number + many)
 
 
 def _bit(word: Array, number: Array) -> Array:

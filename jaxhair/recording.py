@@ -15,7 +15,7 @@ from jaxhair import check, diagnosis
 from jaxhair.pytree import pytree, static
 from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
-from jaxhair.simulate import Setup, advance, prepare, remembered, remembering_step, start
+from jaxhair.simulate import Setup, advance, blank, prepare, remembering_step, start
 from jaxhair.strands import State
 
 
@@ -182,7 +182,7 @@ def _frame(
         time = number.astype(state.positions.dtype) * setup.dt
         return remembering_step(setup, state, memories, time)
 
-    carry = state, remembered(setup, state)
+    carry = state, blank(setup, state)
     state, _ = lax.fori_loop(first, first + steps, one, carry)
     finite = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
     return state, observe(state), jnp.stack(finite).all()

@@ -74,28 +74,27 @@ def step(setup: Setup, state: State, time: Array) -> State:
     return state
 
 
+Memories = tuple[Any, ...]
+"""Of the effects of a phase that remember, in their order."""
+
+
+def blank(setup: Setup, state: State) -> Memories:
+    """Before the first step."""
+    return tuple(e.blank(setup.rod, state) for e in of_kind(setup.effects, RememberingEffect))
+
+
 def remembering_step(
-    setup: Setup, state: State, memories: tuple[Any, ...] | None, time: Array
-) -> tuple[State, tuple[Any, ...]]:
-    """One time step with the memories of effects that have one, None before the first; with those
-    that served in it."""
-    memories = remembered(setup, state, memories)
-    left = iter(memories)
-    effects = tuple(
-        Recalled(e, next(left)) if isinstance(e, RememberingEffect) else e for e in setup.effects
-    )
-    return step(replace(setup, effects=effects), state, time), memories
-
-
-def remembered(
-    setup: Setup, state: State, memories: tuple[Any, ...] | None = None
-) -> tuple[Any, ...]:
-    """The memories that serve in a state, of the effects that have one, in their order."""
-    effects = of_kind(setup.effects, RememberingEffect)
-    before = (None,) * len(effects) if memories is None else memories
-    return tuple(
-        e.remembered(setup.rod, state, memory) for e, memory in zip(effects, before, strict=True)
-    )
+    setup: Setup, state: State, memories: Memories, time: Array
+) -> tuple[State, Memories]:
+    """One time step, and the memories that served in it."""
+    effects: list[Effect] = []
+    kept: list[Any] = []
+    for effect in setup.effects:
+        if isinstance(effect, RememberingEffect):
+            kept.append(effect.remembered(setup.rod, state, memories[len(kept)]))
+            effect = Recalled(effect, kept[-1])
+        effects.append(effect)
+    return step(replace(setup, effects=tuple(effects)), state, time), tuple(kept)
 
 
 def moved(
@@ -203,12 +202,12 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
         return lax.scan(jax.checkpoint(one, prevent_cse=False), carry, numbers)
 
     if steps == 1:  # such as a phase of a treatment; a third of the time to compile
-        return one((state, None), jnp.asarray(first))[0][0]
+        return one((state, blank(setup, state)), jnp.asarray(first))[0][0]
     numbers = first + jnp.arange(steps)
     inner = _near_square_root(steps)
     outer = steps // inner
     blocks = numbers[: outer * inner].reshape(outer, inner)
-    carry = state, remembered(setup, state)
+    carry = state, blank(setup, state)
     carry, _ = lax.scan(jax.checkpoint(many, prevent_cse=False), carry, blocks)
     if outer * inner < steps:
         carry, _ = many(carry, numbers[outer * inner :])

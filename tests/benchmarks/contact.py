@@ -22,7 +22,7 @@ from jax import Array, lax
 
 import jaxhair as jh
 from jaxhair.effects import of_kind
-from jaxhair.simulate import Setup, phase_end, prepare, remembered, remembering_step, start
+from jaxhair.simulate import Setup, blank, phase_end, prepare, remembering_step, start
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import all_pairs
@@ -79,7 +79,7 @@ def pushes(setup: Setup, state: jh.State, steps: int, every_pair: bool = False) 
         return (total + change, change, lists), None
 
     zero = jnp.zeros_like(state.positions)
-    lists = None if every_pair else contact.remembered(setup.rod, swaying(state, jnp.float32(0)))
+    lists = None if every_pair else contact.blank(setup.rod, state)
     return lax.scan(one, (zero, zero, lists), jnp.arange(steps, dtype="float32"))[0]
 
 
@@ -114,12 +114,11 @@ def alone(sizes: list[int], steps: int, repeats: int) -> None:
         setup, state = prepare(scene, scene.phases[0].effects), start(scene)
         found = pushes(setup, state, steps)
         few = repeats if strands < 5000 else 2
-        taken = 1e3 * least_seconds(lambda: pushes(setup, state, steps), few) / steps
+        taken = 1e3 * least_seconds(partial(pushes, setup, state, steps), few) / steps
         times.append(taken)
         pairs = ratio = "-"
-        if strands <= 2000:
-            count = 20 if strands < 1000 else 2
-            slow = least_seconds(lambda: pushes(setup, state, count, True), few) * 1e3 / count
+        if strands <= 600:
+            slow = least_seconds(partial(pushes, setup, state, 4, True), 3) * 1e3 / 4
             pairs, ratio = f"{slow:.2f}", f"{slow / taken:.1f}"
         made = int(found[2].builds)
         off = difference(state, steps, found)
@@ -155,7 +154,7 @@ def _memory(setup: Setup, state: jh.State, steps: int) -> Any:
     def one(number: Array, carry: Any) -> Any:
         return remembering_step(setup, *carry, number.astype("float32") * DT)
 
-    return lax.fori_loop(0, steps, one, (state, remembered(setup, state)))[1][0]
+    return lax.fori_loop(0, steps, one, (state, blank(setup, state)))[1][0]
 
 
 def memory_after(setup: Setup, state: jh.State, steps: int) -> tuple[int, float]:
