@@ -70,9 +70,10 @@ class HairContact(RememberingEffect):
         capacity: edges near a point, in the mean over all points, for which there is room. Time
             and memory grow with it; with too little, near edges are looked for more often.
 
-    Pairs that may touch are kept in lists until hair has moved. Time grows with the number of
-    points. Where more edges touch a point than `capacity`, in the mean, all pushes are NaN, and
-    `jaxhair.simulate` raises an error that says so.
+    Pairs that may touch are kept in lists until hairs have moved against each other, so that time
+    grows with the number of points and not with its square. Where points touch more than `capacity`
+    edges, in the mean, all pushes are NaN, and `jaxhair.simulate` raises an error that says so.
+    Under `jax.vmap` lists are made in every step.
     """
 
     radius: Any = 1e-3
@@ -137,7 +138,8 @@ class HairContact(RememberingEffect):
     def remembered(self, rod: Rod, state: State, memory: Lists) -> Lists:
         """The lists as they are, if they hold, or new ones."""
         # which edges are near is no number: no derivative goes through it
-        rod, x, radius = lax.stop_gradient((rod, state.positions, jnp.asarray(self.radius)))
+        rod, x = lax.stop_gradient((rod, state.positions))
+        radius = lax.stop_gradient(jnp.asarray(self.radius, x.dtype))
         return lax.cond(memory.hold(x), lambda: memory, lambda: _renewed(memory, rod, x, radius))
 
     def fault(self, rod: Rod, state: State) -> str:
