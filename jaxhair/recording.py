@@ -15,7 +15,7 @@ from jaxhair import check, diagnosis
 from jaxhair.pytree import pytree, static
 from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
-from jaxhair.simulate import Setup, advance, prepare, start, step
+from jaxhair.simulate import Setup, advance, blank, prepare, remembering_step, start
 from jaxhair.strands import State
 
 
@@ -177,10 +177,13 @@ def _frame(
     share one compiled program; it is a `while` loop, which has no reverse mode and needs none here.
     """
 
-    def one(number: Array, state: State) -> State:
-        return step(setup, state, number.astype(state.positions.dtype) * setup.dt)
+    def one(number: Array, carry: tuple[State, Any]) -> tuple[State, Any]:
+        state, memories = carry
+        time = number.astype(state.positions.dtype) * setup.dt
+        return remembering_step(setup, state, memories, time)
 
-    state = lax.fori_loop(first, first + steps, one, state)
+    carry = state, blank(setup, state)
+    state, _ = lax.fori_loop(first, first + steps, one, carry)
     finite = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
     return state, observe(state), jnp.stack(finite).all()
 
