@@ -93,8 +93,12 @@ def remembering_step(
     """
     effects: list[Effect] = []
     kept: list[Any] = []
+    still = bool(of_kind(setup.effects, PoseEffect))  # where velocities change nothing
     for effect in setup.effects:
         if isinstance(effect, RememberingEffect):
+            if still:
+                kept.append(memories[len(kept)])
+                continue
             kept.append(effect.remembered(setup.rod, state, memories[len(kept)]))
             effect = Recalled(effect.recalled_change(setup.rod, state, setup.dt, kept[-1]))
         effects.append(effect)
