@@ -171,7 +171,8 @@ def _with_kinds(x: Array, changed: dict[int, Array]) -> Array:
     """x, of shape (inner points, 4, ..., strands), with some kinds' values replaced."""
     if not changed:
         return x
-    return jnp.stack([changed.get(j, x[:, j]) for j in range(len(BONDS))], axis=1)
+    kinds = range(len(BONDS))
+    return jnp.stack([changed[j] if j in changed else x[:, j] for j in kinds], axis=1)
 
 
 class _Toward(BondEffect):

@@ -15,6 +15,7 @@ from jaxhair.effects import (
     HoldingEffect,
     PoseEffect,
     PositionEffect,
+    RememberingEffect,
     StiffnessEffect,
     VelocityEffect,
     of_kind,
@@ -149,6 +150,10 @@ def _blame(
         overflow = bool(bad.any())
         if overflow and culprit is not None:
             place = _place(_by_point(bad, len(state.positions)))
+            if isinstance(culprit, RememberingEffect) and (
+                fault := culprit.fault(setup.rod, start)
+            ):
+                return Cause(place, f"{_name(culprit)} {fault}")
             fault = "gives values that are not finite there"
             return Cause(place, f"{_name(culprit)} {fault}; {_advice(culprit)}")
         if overflow:

@@ -8,9 +8,11 @@ strand alone, let it say so (`Effect.each_strand_alone`): many strands are then 
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from jax import Array
+
+from jaxhair.pytree import pytree
 
 if TYPE_CHECKING:
     from jaxhair.rods import Rod
@@ -44,6 +46,51 @@ class VelocityEffect(Effect):
     @abstractmethod
     def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
         """Change of velocity [m/s] over a step, shape (points, 3, strands)."""
+
+
+class RememberingEffect(VelocityEffect):
+    """Keeps from step to step what it can make anew from any state: lists of neighbours.
+
+    A memory saves time and changes no result but by rounding. It belongs to the loop over steps,
+    which starts without one, and not to a State.
+    """
+
+    @abstractmethod
+    def blank(self, rod: "Rod", state: "State") -> Any:
+        """The memory before the first step, which serves in no state; same shapes as any other."""
+
+    @abstractmethod
+    def remembered(self, rod: "Rod", state: "State", memory: Any) -> Any:
+        """The memory that serves in a state: the one given, if it still does, or a new one."""
+
+    @abstractmethod
+    def recalled_change(self, rod: "Rod", state: "State", dt: float, memory: Any) -> Array:
+        """The change of velocity [m/s] over a step, by a memory that serves in its state."""
+
+    def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
+        """The change of velocity [m/s] over a step, without a memory from before."""
+        memory = self.remembered(rod, state, self.blank(rod, state))
+        return self.recalled_change(rod, state, dt, memory)
+
+    def fault(self, rod: "Rod", state: "State") -> str:
+        """What of the effect does not go with a state, and what to change; "" if nothing."""
+        return ""
+
+
+@pytree
+class Recalled(VelocityEffect):
+    """What an effect with a memory changes in a step.
+
+    Arguments:
+        change: of velocity [m/s], shape (points, 3, strands).
+    """
+
+    change: Any
+
+    def velocity_change(self, rod: "Rod", state: "State", dt: float) -> Array:
+        """The change."""
+        given: Array = self.change
+        return given
 
 
 class PositionEffect(Effect):

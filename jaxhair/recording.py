@@ -15,7 +15,7 @@ from jaxhair import check, diagnosis, tiles
 from jaxhair.pytree import pytree, static
 from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
-from jaxhair.simulate import Setup, advance, prepare, start, step
+from jaxhair.simulate import Setup, advance, blank, prepare, remembering_step, start
 from jaxhair.strands import State
 
 
@@ -182,10 +182,12 @@ def _frame(
     """
 
     def advanced(setup: Setup, state: State, first: Array, steps: Array) -> State:
-        def one(number: Array, state: State) -> State:
-            return step(setup, state, number.astype(state.positions.dtype) * setup.dt)
+        def one(number: Array, carry: tuple[State, Any]) -> tuple[State, Any]:
+            state, memories = carry
+            time = number.astype(state.positions.dtype) * setup.dt
+            return remembering_step(setup, state, memories, time)
 
-        return lax.fori_loop(first, first + steps, one, state)
+        return lax.fori_loop(first, first + steps, one, (state, blank(setup, state)))[0]
 
     state = tiles.spread(advanced, setup, state, first, steps)
     finite = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]

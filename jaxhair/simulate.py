@@ -17,6 +17,8 @@ from jaxhair.effects import (
     HoldingEffect,
     PoseEffect,
     PositionEffect,
+    Recalled,
+    RememberingEffect,
     StiffnessEffect,
     VelocityEffect,
     of_kind,
@@ -75,6 +77,41 @@ def step(setup: Setup, state: State, time: Array) -> State:
         q = state.orientations
         state = bond.reformed(state, rises, rods.darboux(q[:-1], q[1:]))
     return state
+
+
+Memories = tuple[Any, ...]
+"""Of the effects of a phase that remember, in their order."""
+
+
+def blank(setup: Setup, state: State) -> Memories:
+    """Before the first step."""
+    return tuple(e.blank(setup.rod, state) for e in of_kind(setup.effects, RememberingEffect))
+
+
+def remembering_step(
+    setup: Setup, state: State, memories: Memories, time: Array
+) -> tuple[State, Memories]:
+    """One time step, as one kernel where it fits, and the memories that served in it.
+
+    Searching memories does not fit into a kernel, and what users add may not: see `one_kernel`.
+    """
+    effects: list[Effect] = []
+    kept: list[Any] = []
+    still = bool(of_kind(setup.effects, PoseEffect))  # where velocities change nothing
+    for effect in setup.effects:
+        if isinstance(effect, RememberingEffect):
+            if still:
+                kept.append(memories[len(kept)])
+                continue
+            kept.append(effect.remembered(setup.rod, state, memories[len(kept)]))
+            effect = Recalled(effect.recalled_change(setup.rod, state, setup.dt, kept[-1]))
+        effects.append(effect)
+    setup = replace(setup, effects=tuple(effects))
+    own = all(type(x).__module__.startswith("jaxhair.") for x in (*effects, setup.solver))
+    return (_kernel if own else step)(setup, state, time), tuple(kept)
+
+
+_kernel = one_kernel(step)
 
 
 def moved(
@@ -184,25 +221,25 @@ def _advanced(setup: Setup, state: State, first: Array, *, steps: int) -> State:
     computed a second and third time instead.
     """
 
-    own = all(type(x).__module__.startswith("jaxhair.") for x in (*setup.effects, setup.solver))
-    whole_step = one_kernel(step) if own else step  # what others add may not work in a kernel
+    def one(carry: Any, number: Array) -> tuple[Any, None]:
+        state, memories = carry
+        time = number.astype(state.positions.dtype) * setup.dt
+        return remembering_step(setup, state, memories, time), None
 
-    def one(state: State, number: Array) -> tuple[State, None]:
-        return whole_step(setup, state, number.astype(state.positions.dtype) * setup.dt), None
-
-    def many(state: State, numbers: Array) -> tuple[State, None]:
-        return lax.scan(jax.checkpoint(one, prevent_cse=False), state, numbers)
+    def many(carry: Any, numbers: Array) -> tuple[Any, None]:
+        return lax.scan(jax.checkpoint(one, prevent_cse=False), carry, numbers)
 
     if steps == 1:  # such as a phase of a treatment; a third of the time to compile
-        return one(state, first)[0]
+        return one((state, blank(setup, state)), first)[0][0]
     numbers = first + jnp.arange(steps)
     inner = _near_square_root(steps)
     outer = steps // inner
     blocks = numbers[: outer * inner].reshape(outer, inner)
-    state, _ = lax.scan(jax.checkpoint(many, prevent_cse=False), state, blocks)
+    carry = state, blank(setup, state)
+    carry, _ = lax.scan(jax.checkpoint(many, prevent_cse=False), carry, blocks)
     if outer * inner < steps:
-        state, _ = many(state, numbers[outer * inner :])
-    return state
+        carry, _ = many(carry, numbers[outer * inner :])
+    return carry[0]
 
 
 def _near_square_root(steps: int) -> int:

@@ -54,6 +54,7 @@ QUATERNION = "tests/test_quaternion.py"
 ZERO = (QUATERNION, "-k", "gradients_at_zero or norms")
 RAGGED = ("tests/test_oracle.py", "-k", "one_step and ragged")
 ONE_STEP = ("tests/test_oracle.py", "-k", "one_step")
+CONTACT = ("tests/test_contact.py",)
 SIGNS = ("tests/test_invariants.py", "-k", "signs_of_frames")
 
 MUTATIONS = (
@@ -249,8 +250,8 @@ MUTATIONS = (
     Mutation(
         "jaxhair/contact.py",
         "edge of no length",
-        "place / jnp.where(square == 0, 1, square)",
-        "place / square",
+        "quat.dot(p - start, along) / jnp.where(square == 0, 1, square)",
+        "quat.dot(p - start, along) / square",
         ("tests/test_equations_15_to_19.py", "-k", "18"),
     ),
     Mutation(
@@ -263,8 +264,8 @@ MUTATIONS = (
     Mutation(
         "jaxhair/contact.py",
         "nearest point within the edge",
-        "place = jnp.clip(place / jnp.where(square == 0, 1, square), 0, 1)",
-        "place = place / jnp.where(square == 0, 1, square)",
+        "jnp.clip(quat.dot(p - start, along) / jnp.where(square == 0, 1, square), 0, 1)",
+        "quat.dot(p - start, along) / jnp.where(square == 0, 1, square)",
         ("tests/test_equations_15_to_19.py", "-k", "18"),
     ),
     Mutation(
@@ -277,9 +278,44 @@ MUTATIONS = (
     Mutation(
         "jaxhair/contact.py",
         "missing edges push nothing",
-        "mask = others & there if rod.ragged else others",
-        "mask = others",
+        "if rod.ragged:",
+        "if False:",
         RAGGED,
+    ),
+    Mutation(
+        "jaxhair/contact.py",
+        "lists are made again once hair has moved",
+        "return jnp.sqrt(jnp.sum(box**2)) <= self.skin",
+        "return jnp.sqrt(jnp.sum(box**2)) <= 4 * self.skin",
+        CONTACT,
+    ),
+    Mutation(
+        "jaxhair/contact.py",
+        "lists that do not hold push with NaN",
+        "jnp.where(holds, jnp.stack(total), jnp.nan)",
+        "jnp.stack(total)",
+        CONTACT,
+    ),
+    Mutation(
+        "jaxhair/contact.py",
+        "skins shrink until lists have room",
+        "(carry[1].count > room) & (carry[1].skin >= 0)",
+        "(carry[1].count > room) & (carry[1].builds < builds)",
+        CONTACT,
+    ),
+    Mutation(
+        "jaxhair/neighbours.py",
+        "an edge without length, in the search",
+        "across = along / jnp.where(square == 0, 1, square)",
+        "across = along / square",
+        ("tests/test_equations_15_to_19.py", "-k", "18"),
+    ),
+    Mutation(
+        "jaxhair/neighbours.py",
+        "points and edges that are missing have no box",
+        "there = ~jnp.isnan(p + q)",
+        "there = p == p",
+        CONTACT,
     ),
     Mutation(
         "jaxhair/obstacles.py",

@@ -95,7 +95,7 @@ CASES: dict[str, Case] = {
     "Drag": (jh.Drag, {"time": 0.1}),
     "Wind": (jh.Wind, {"blower": O, "target": X, "strength": 1.0, "width": 0.1}),
     "DryingWind": (jh.DryingWind, {"blower": O, "target": X, "strength": 1.0, "drying": 0.1}),
-    "HairContact": (jh.HairContact, {"radius": 1e-3, "strength": 2.0}),
+    "HairContact": (jh.HairContact, {"radius": 1e-3, "strength": 2.0, "capacity": 3}),
     "Floor": (jh.Floor, {"height": 0.0, "friction": 0.1, "velocity": X}),
     "Sphere": (jh.Sphere, {"centre": O, "radius": 0.1, "friction": 0.1, **MOTION}),
     "Cylinder": (

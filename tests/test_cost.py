@@ -90,18 +90,13 @@ def test_operations_of_a_step_are_those_of_its_unrolled_program(solver: Any) -> 
 
 
 def test_operations_of_effects_counted_by_hand() -> None:
-    """Gravity adds a vector to each point; a floor is dearer, and contact has all pairs."""
+    """Gravity adds a vector to each point; a floor is dearer, and contact by far the dearest."""
     scene, state = bare(scene_of(solver=jh.PositionBased()))
     parts = plan(scene, (*HELD, jh.Floor(-0.1)), state).operations
     assert parts["Gravity"] == pytest.approx(3 * STRANDS * POINTS, abs=5)
     assert parts["Floor"] > parts["Gravity"]
-    contact = []
-    for strands in (10, 30):
-        hair = jh.Strands.straight(np.ones((strands, 3)), (0, 0, -1.0), length=0.1, points=POINTS)
-        scene, state = bare(jh.Scene(hair, solver=jh.PositionBased(iterations=1)))
-        with_it = operations.of_a_step(scene, (jh.HairContact(),), state)
-        contact.append(with_it - operations.of_a_step(scene, (), state))
-    assert contact[1] / contact[0] == pytest.approx(9, rel=0.1)
+    contact = plan(scene, (*HELD, jh.HairContact()), state).operations["HairContact"]
+    assert contact > 10 * parts["Floor"]
 
 
 def test_operations_of_the_solver_and_of_the_rest_shape_alone() -> None:

@@ -57,7 +57,8 @@ def random_hair(strands: int, points: int, ragged: bool, seed: int = 1) -> tuple
 def as_oracle(effect: object) -> dict:
     """An effect as the oracle's dict."""
     values = {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
-    values.pop("in_gradients", None)  # the oracle has values only
+    for name in ("in_gradients", "capacity"):  # the oracle has values only, and looks at all pairs
+        values.pop(name, None)
     if isinstance(effect, DryingWind):
         values["rate"] = values.pop("drying")
     if "amount" in values:

@@ -67,7 +67,7 @@ def run(options: argparse.Namespace, scene: Scene) -> int:
 
 def _check(folder: Path, *, overwrite: bool) -> None:
     """Raises what writing would raise, before anything is measured."""
-    from jaxhair.figures import optional
+    from jaxhair.extras import optional
 
     optional("matplotlib")
     for path in (folder / name for name in FILES):

@@ -6,7 +6,8 @@ from typing import Any
 from jaxhair.cost import table
 from jaxhair.cost.measuring import Part, PhaseCost, SceneCost
 from jaxhair.cost.parts import ELASTICITY, ITSELF, REST_SHAPE
-from jaxhair.figures import figure, optional
+from jaxhair.extras import optional
+from jaxhair.figures import figure
 from jaxhair.output import new_file
 
 COLORS = {"effect": "#1f6f8b", "step without effects": "#9aa5b1", "shared or rounding": "#dd9b30"}

@@ -1,0 +1,178 @@
+"""Which edges of other strands are near which points, found in time linear in their number.
+
+Points are sorted along a curve that fills space (Morton's), so that each 32 of them in a row, a
+block, lie close together, and so do the edges that start at them. Boxes around blocks, and around
+32 blocks, tell which blocks are near each other; only between those are distances computed.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+BLOCK = 32
+"""Points in a block, and blocks in a group: the bits of a word, one for each edge of a block."""
+TILES = 64
+"""Pairs of blocks whose distances are computed together."""
+ROOM = 512
+"""Pairs of a point and an edge that are listed together."""
+
+
+class Pairs(NamedTuple):
+    """Pairs of a point and an edge that are near each other, in no particular order.
+
+    points, edges: numbers of the points and of the points where the edges start, shape (capacity,);
+        behind the last pair, the number of points, which is no point.
+    number: of pairs that are near, also of those that found no room, shape ().
+    """
+
+    points: Array
+    edges: Array
+    number: Array
+
+
+def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacity: int) -> Pairs:
+    """The pairs of a point and an edge of another strand whose distance is less than `reach`.
+
+    Arguments:
+        starts: points [m], shape (3, points); NaN where there is none.
+        ends: of the edge that starts at each point [m], shape (3, points); NaN where there is none.
+        strands: number of the strand of each point, shape (points,).
+        reach: [m], shape ().
+    """
+    size = starts.shape[1]
+    order = jnp.argsort(_along_the_curve(starts)).astype(jnp.int32)
+    groups = -(-size // BLOCK**2)
+    order = jnp.pad(order, (0, groups * BLOCK**2 - size), constant_values=size)
+
+    def blocks(x: Array, nothing: Any) -> Array:
+        """(components, points) to (components, blocks, block)."""
+        x = x.at[:, order].get(mode="fill", fill_value=nothing)
+        return x.reshape(len(x), -1, BLOCK)
+
+    p, q = blocks(starts, jnp.nan), blocks(ends, jnp.nan)
+    own = blocks(strands[None], -1)[0]
+    of_points, of_edges = _box(p, p), _box(p, q)
+    along = q - p
+    square = jnp.sum(along**2, axis=0, keepdims=True)
+    across = along / jnp.where(square == 0, 1, square)
+    pairs_of_groups, many_groups = _listed(_near(_whole(of_points), _whole(of_edges), reach))
+
+    def of_groups(number: Array, found: Pairs) -> Pairs:
+        """With the pairs of the points of one group and the edges of another."""
+        first, second = jnp.divmod(pairs_of_groups[number], groups)
+        near = _near(_of_group(of_points, first), _of_group(of_edges, second), reach)
+        tiles, many = _listed(near)
+
+        def some(carry: tuple[Array, Pairs]) -> tuple[Array, Pairs]:
+            done, found = carry
+            number = done + jnp.arange(TILES, dtype=done.dtype)
+            a, b = jnp.divmod(tiles[jnp.minimum(number, BLOCK**2 - 1)], BLOCK)
+            a, b = first * BLOCK + a, second * BLOCK + b
+            apart = p[:, a, None] - p[:, b, :, None]  # (3, tiles, edges, points)
+            place = jnp.clip(jnp.sum(apart * across[:, b, :, None], axis=0, keepdims=True), 0, 1)
+            square = jnp.sum((apart - place * along[:, b, :, None]) ** 2, axis=0)
+            near = (square < reach**2) & (own[a, None] != own[b, :, None])
+            words = _words(near)
+            words = jnp.where((number < many)[:, None], words, 0)
+            return done + TILES, _with(found, words, a, b, order)
+
+        start = jnp.zeros_like(many), found
+        return lax.while_loop(lambda carry: carry[0] < many, some, start)[1]
+
+    none = jnp.full(capacity + ROOM, size, jnp.int32)
+    found = Pairs(none, none, jnp.zeros((), jnp.int32))
+    found = lax.fori_loop(0, many_groups, of_groups, found)
+    inside = jnp.arange(capacity, dtype=jnp.int32) < found.number
+    points, edges = (jnp.where(inside, x[:capacity], size) for x in found[:2])
+    return Pairs(points, edges, found.number)
+
+
+def _listed(true: Array) -> tuple[Array, Array]:
+    """The places of what is true in a flattened mask, then zeros; and how many are true."""
+    places = jnp.nonzero(true.ravel(), size=true.size, fill_value=0)[0]
+    return places.astype(jnp.int32), jnp.sum(true, dtype=jnp.int32)
+
+
+def _along_the_curve(points: Array) -> Array:
+    """Morton's key of points (3, points): the bits of their coordinates, interleaved."""
+    low = jnp.nanmin(points, axis=1, keepdims=True)
+    extent = jnp.nanmax(points - low)
+    at = (points - low) * jnp.where(extent > 0, 1023 / jnp.where(extent > 0, extent, 1), 0)
+    x = jnp.where(jnp.isfinite(at), at, 0).astype(jnp.int32)
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        x = (x | (x << shift)) & mask
+    return x[0] | (x[1] << 1) | (x[2] << 2)
+
+
+Box = tuple[Array, Array]
+"""Lowest and highest coordinates, each of shape (3, boxes)."""
+
+
+def _box(p: Array, q: Array) -> Box:
+    """Boxes around segments (3, boxes, segments), of which those with NaN do not count."""
+    there = ~jnp.isnan(p + q)
+    low = jnp.min(jnp.where(there, jnp.minimum(p, q), jnp.inf), axis=-1)
+    return low, jnp.max(jnp.where(there, jnp.maximum(p, q), -jnp.inf), axis=-1)
+
+
+def _whole(boxes: Box) -> Box:
+    """Boxes around groups of boxes."""
+    low, high = (x.reshape(3, -1, BLOCK) for x in boxes)
+    return low.min(axis=-1), high.max(axis=-1)
+
+
+def _of_group(boxes: Box, number: Array) -> Box:
+    low, high = (lax.dynamic_slice_in_dim(x, number * BLOCK, BLOCK, axis=1) for x in boxes)
+    return low, high
+
+
+def _near(a: Box, b: Box, reach: Array) -> Array:
+    """Whether boxes are nearer than `reach`, shape (boxes of a, boxes of b). Empty ones are not."""
+    (low_a, high_a), (low_b, high_b) = a, b
+    gap = jnp.maximum(low_b[:, None] - high_a[:, :, None], low_a[:, :, None] - high_b[:, None])
+    return jnp.sum(jnp.maximum(gap, 0) ** 2, axis=0) < reach**2
+
+
+def _words(true: Array) -> Array:
+    """What is true of 32 edges in the bits of a word: (tiles, edges, points) to (tiles, points)."""
+    bits = jnp.uint32(1) << jnp.arange(BLOCK, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(true, bits[None, :, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+
+
+def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array) -> Pairs:
+    """With the pairs that words of bits (tiles, BLOCK) name, of points in blocks a, edges in b."""
+    capacity = len(found.points) - ROOM
+    words = words.ravel()
+    ends = jnp.cumsum(lax.population_count(words).astype(jnp.int32))
+    many = ends[-1]
+
+    def some(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        done, points, edges = carry
+        number = done + jnp.arange(ROOM, dtype=jnp.int32)
+        word = jnp.searchsorted(ends, number, side="right").astype(jnp.int32)
+        word = jnp.minimum(word, len(words) - 1)
+        before = ends[word] - lax.population_count(words[word]).astype(jnp.int32)
+        tile, point = jnp.divmod(word, BLOCK)
+        edge = _bit(words[word], number - before)
+        at = jnp.minimum(found.number + done, capacity)
+        points = lax.dynamic_update_slice(points, order[a[tile] * BLOCK + point], (at,))
+        edges = lax.dynamic_update_slice(edges, order[b[tile] * BLOCK + edge], (at,))
+        return done + ROOM, points, edges
+
+    carry = jnp.zeros((), jnp.int32), found.points, found.edges
+    _, points, edges = lax.while_loop(lambda carry: carry[0] < many, some, carry)
+    return Pairs(points, edges, found.number + many)
+
+
+def _bit(word: Array, number: Array) -> Array:
+    """The place of the bit of a word that is set and has so many others that are set below it."""
+    place = jnp.zeros_like(number)
+    for width in (16, 8, 4, 2, 1):
+        low = word & jnp.uint32(2**width - 1)
+        below = lax.population_count(low).astype(number.dtype)
+        above = number >= below
+        number = jnp.where(above, number - below, number)
+        place = jnp.where(above, place + width, place)
+        word = jnp.where(above, word >> jnp.uint32(width), low)
+    return place
