@@ -145,7 +145,7 @@ class HairContact(RememberingEffect):
     def fault(self, rod: Rod, state: State) -> str:
         """That more edges touch points than there is room for."""
         lists = self.remembered(rod, state, self.blank(rod, state))
-        if lists.skin >= 0 or not np.isfinite(state.positions).all():
+        if lists.count <= lists.points.size:
             return ""
         mean = int(lists.count) / state.positions[:, 0].size
         return (
@@ -173,7 +173,8 @@ def _renewed(memory: Lists, rod: Rod, x: Array, radius: Array) -> Lists:
         pairs = near_pairs(_flat(starts), _flat(ends), of_strands, reach, room)
         at, edges = (numbers.reshape(memory.points.shape) for numbers in pairs[:2])
         none = (pairs.number > room) & (skin == 0)
-        lists = Lists(at, edges, pairs.number, jnp.where(none, -1, skin), x, builds)
+        far = ~jnp.isfinite(reach**2)  # so large are positions that no distance can be told
+        lists = Lists(at, edges, pairs.number, jnp.where(none | far, -1, skin), x, builds)
         smaller = skin * jnp.minimum(lists.fitting(), 0.7)
         return jnp.where(smaller < LEAST * edge, 0, smaller), lists
 
