@@ -155,7 +155,7 @@ def fit_each(
         checkpoint: a folder in which the strands are kept after each simulation of all; as for
             `fitting.fit`, the same fit goes on from there to the same result bit for bit.
 
-    Tiles go to `jax.devices()` in turn. A strand that has converged is simulated no more.
+    Tiles go to `jax.local_devices()` in turn. A strand that has converged is simulated no more.
 
     Raises ValueError for an unknown phase or leaf, a leaf that cannot differ between strands,
     targets of other numbers than points, hair that touches hair, and a checkpoint that is of other

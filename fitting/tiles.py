@@ -146,7 +146,7 @@ class Tiles:
             lambda x: np.asarray(x, self.scene.dtype),
             {"leaves": of_strands, "shapes": shapes, "starts": [p.start for p in parameters]},
         )
-        self.devices = jax.devices()
+        self.devices = jax.local_devices()
         self._evaluate = jax.jit(self._residuals_and_jacobian)
         self.weights = MM / noise_mm * np.concatenate(self._sizes(noise_mm))
         self.residuals = self.weights.size

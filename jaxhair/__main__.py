@@ -1,9 +1,13 @@
 """The command line: `python -m jaxhair simulate perm --output perm.png`, `accuracy`, `cost`."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
+
+import jax
 
 from jaxhair import check, scenes
 from jaxhair.accuracy import command as accuracy
@@ -41,6 +45,13 @@ def parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="keep the frames in this folder every 10 seconds: however the work is interrupted, "
         "the same command goes on from there, to the same frames. Delete it when all is done",
+    )
+    run.add_argument(
+        "--devices",
+        type=int,
+        default=1,
+        help="spread the strands over so many devices: accelerators, or on a CPU the cores; not "
+        "with hair against hair (1)",
     )
     run.add_argument("--quiet", action="store_true", help="show no progress")
     accuracy.add_command(commands)
@@ -174,10 +185,20 @@ def _solver(options: argparse.Namespace) -> Solver:
     return solver
 
 
+def _split_cpu(devices: int) -> None:
+    """Lets the CPU count as several devices, unless JAX has started or was told already."""
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        with suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", devices)  # type: ignore[no-untyped-call]
+
+
 def _simulate(options: argparse.Namespace) -> int:
     check_ending(options.output)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
+    check.whole("--devices", options.devices, least=1)
+    if options.devices > 1:
+        _split_cpu(options.devices)
     failed = False
     try:
         recording = simulate(
@@ -185,6 +206,7 @@ def _simulate(options: argparse.Namespace) -> int:
             fps=options.fps,
             progress=not options.quiet,
             checkpoint=options.checkpoint,
+            devices=options.devices,
         )
     except NotFinite as error:
         failed, recording = True, error.recording

@@ -214,6 +214,7 @@ class Cut(_Toward):
         rate: largest fall in a second [1/s]; None cuts at once.
     """
 
+    each_strand_alone = True
     hydrogen: Any = None
     ionic: Any = None
     disulfide: Any = None
@@ -239,6 +240,7 @@ class Reform(_Toward):
         rate: largest rise in a second [1/s]; None re-forms at once.
     """
 
+    each_strand_alone = True
     hydrogen: Any = None
     ionic: Any = None
     disulfide: Any = None

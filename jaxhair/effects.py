@@ -2,12 +2,13 @@
 
 A phase of a scene lists its effects in a tuple. The step asks each for what its kind gives; what
 is not in the tuple is not traced and leaves no operation behind. To add an effect, make a frozen
-dataclass with `jaxhair.pytree` that derives from one or more of these classes.
+dataclass with `jaxhair.pytree` that derives from one or more of these classes. If it works on each
+strand alone, let it say so (`Effect.each_strand_alone`): many strands are then simulated faster.
 """
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from jax import Array
 
@@ -22,7 +23,16 @@ T = TypeVar("T")
 
 
 class Effect:
-    """Anything a phase can list."""
+    """Anything a phase can list.
+
+    each_strand_alone: what it gives for a strand depends on no other strand, so that strands may be
+        simulated in tiles and on several devices. Arrays of a value for each strand must then
+        have the strands on the last axis, as `State` has, and may have no other axis last that
+        happens to be as long. Each class says it of itself; a class that derives from it, and
+        may do anything, says it again.
+    """
+
+    each_strand_alone: ClassVar[bool] = False
 
 
 def of_kind(effects: Iterable[Effect], kind: type[T]) -> tuple[T, ...]:

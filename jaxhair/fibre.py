@@ -155,6 +155,7 @@ class Soften(StiffnessEffect):
         factor: in [0, 1]; wet hair has about 0.4 of the dry hair's stiffness (Robbins).
     """
 
+    each_strand_alone = True
     factor: Any = 0.4
 
     def __post_init__(self) -> None:

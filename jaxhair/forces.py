@@ -22,6 +22,7 @@ class Gravity(VelocityEffect):
         acceleration: g [m/s^2], shape (3,).
     """
 
+    each_strand_alone = True
     acceleration: Any = (0.0, 0.0, -9.80)
 
     def __post_init__(self) -> None:
@@ -41,6 +42,7 @@ class TipForce(VelocityEffect):
         force: F [N], shape (3,); a weight of 1 mg is (0, 0, -9.8e-6).
     """
 
+    each_strand_alone = True
     force: Any
 
     def __post_init__(self) -> None:
@@ -64,6 +66,7 @@ class Drag(VelocityEffect):
         time: T [s], above 0. The result over a second does not depend on dt.
     """
 
+    each_strand_alone = True
     time: Any = 0.1
 
     def __post_init__(self) -> None:
@@ -85,6 +88,7 @@ class Wind(VelocityEffect):
         width: the length by which the distance from the axis is counted [m]; the paper's 1 cm.
     """
 
+    each_strand_alone = True
     blower: Any
     target: Any
     strength: Any
@@ -134,6 +138,7 @@ class DryingWind(Wind, BondEffect):
             [s/m]; the paper's 0.003.
     """
 
+    each_strand_alone = True
     drying: Any = 0.003
 
     def __post_init__(self) -> None:

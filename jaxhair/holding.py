@@ -27,6 +27,7 @@ class Hold(HoldingEffect):
             must be where nothing turns.
     """
 
+    each_strand_alone = True
     part: str = static(default="root")
     clamped: bool = static(default=True)
     velocity: Any = None
@@ -93,6 +94,7 @@ class Wound(PoseEffect):
         climb: angle between the helix and the rod's cross-section [rad], in [-pi/2, pi/2].
     """
 
+    each_strand_alone = True
     diameter: Any
     climb: Any = 0.0
 
@@ -126,6 +128,8 @@ class Unloaded(PoseEffect):
     What hair comes to when no force acts on it: sum_j f_j b_j (Omega - Omega_j) = 0. The solvers
     take many steps to get there, as many more as the square of the number of points.
     """
+
+    each_strand_alone = True
 
     def pose(self, rod: Rod, state: State) -> tuple[Array, Array]:
         """q_(i+1) = q_i r with the vector part sum_j f_j b_j Omega_j / sum_j f_j b_j of r.

@@ -93,6 +93,7 @@ class Floor(Obstacle):
         velocity: of the floor [m/s], shape (3,); None stands still.
     """
 
+    each_strand_alone = True
     height: Any = 0.0
     friction: Any = 0.0
     velocity: Any = None
@@ -131,6 +132,7 @@ class Sphere(Obstacle):
         velocity: [m/s], angular_velocity: [rad/s], shape (3,); None stands still.
     """
 
+    each_strand_alone = True
     centre: Any
     radius: Any
     friction: Any = 0.0
@@ -176,6 +178,7 @@ class Cylinder(Obstacle):
             its direction: the rod may only spin about it.
     """
 
+    each_strand_alone = True
     centre: Any
     axis: Any
     radius: Any

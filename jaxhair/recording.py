@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxhair import check, diagnosis
+from jaxhair import check, diagnosis, tiles
 from jaxhair.pytree import pytree, static
 from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
@@ -76,6 +76,7 @@ def simulate(
     progress: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_seconds: float = 10.0,
+    devices: int = 1,
 ) -> Recording:
     """Simulates a scene and records frames.
 
@@ -90,17 +91,20 @@ def simulate(
             same scene goes on from there, however the work ended, to the same frames bit for bit
             (on the same kind of machine). One process at a time may use it.
         checkpoint_seconds: wall time between two writes to it [s].
+        devices: over which the strands are spread; see `run`.
 
     Ctrl-C ends the simulation and returns the frames so far, with `complete` False. Under a JAX
     transformation all frames are computed in one traced program, and nothing is shown or kept.
 
-    Raises ValueError for fps that are not above 0 and for a checkpoint that is of other work or
-    damaged, and NotFinite at the first frame with values that are NaN or infinite.
+    Raises ValueError for fps that are not above 0, for devices as `run` does and for a checkpoint
+    that is of other work or damaged, and NotFinite at the first frame with values that are NaN or
+    infinite.
     """
     check.instance("scene", scene, Scene)
     check.flag("progress", progress)
     check.not_negative("checkpoint_seconds", checkpoint_seconds)
     every = max(1, round(1 / (check.constant("fps", fps) * scene.dt)))
+    devices = tiles.checked_devices(scene, devices)
     numbers = scene.as_arrays()
     times, names = _frame_times(scene, every)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scene)):
@@ -108,10 +112,10 @@ def simulate(
             raise ValueError(
                 f"checkpoint is {checkpoint!r}; under a JAX transformation it must be None"
             )
-        observed = _traced(numbers, observe, every)
+        observed = _traced(numbers, observe, every, devices)
         return Recording(scene, jnp.asarray(times, scene.dtype), observed, tuple(names))
-    saved = _saved_frames(checkpoint, float(checkpoint_seconds), numbers, observe, every)
-    frames, complete, failure = _interruptible(numbers, observe, every, progress, saved)
+    saved = _saved_frames(checkpoint, float(checkpoint_seconds), numbers, observe, every, devices)
+    frames, complete, failure = _interruptible(numbers, observe, every, progress, saved, devices)
     n = len(frames)
     recording = Recording(
         scene, np.asarray(times[:n]), _stacked(frames, observe, numbers), tuple(names[:n]), complete
@@ -144,12 +148,12 @@ def _frame_times(scene: Scene, every: int) -> tuple[list[float], list[str]]:
     return times, names
 
 
-def _traced(scene: Scene, observe: Callable[[State], Any], every: int) -> Any:
+def _traced(scene: Scene, observe: Callable[[State], Any], every: int, devices: int) -> Any:
     """All frames, as one traced program."""
     state = start(scene)
     parts = [jax.tree.map(lambda x: x[None], observe(state))]
     for phase in scene.phases:
-        setup = prepare(scene, phase.effects)
+        setup = prepare(scene, phase.effects, devices)
         whole, rest = divmod(phase.steps(scene.dt), every)
 
         def frame(state: State, first: Array, setup: Setup = setup) -> tuple[State, Any]:
@@ -164,7 +168,7 @@ def _traced(scene: Scene, observe: Callable[[State], Any], every: int) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
-_prepare = jax.jit(prepare)
+_prepare = jax.jit(prepare, static_argnums=2)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -177,13 +181,15 @@ def _frame(
     share one compiled program; it is a `while` loop, which has no reverse mode and needs none here.
     """
 
-    def one(number: Array, carry: tuple[State, Any]) -> tuple[State, Any]:
-        state, memories = carry
-        time = number.astype(state.positions.dtype) * setup.dt
-        return remembering_step(setup, state, memories, time)
+    def advanced(setup: Setup, state: State, first: Array, steps: Array) -> State:
+        def one(number: Array, carry: tuple[State, Any]) -> tuple[State, Any]:
+            state, memories = carry
+            time = number.astype(state.positions.dtype) * setup.dt
+            return remembering_step(setup, state, memories, time)
 
-    carry = state, blank(setup, state)
-    state, _ = lax.fori_loop(first, first + steps, one, carry)
+        return lax.fori_loop(first, first + steps, one, (state, blank(setup, state)))[0]
+
+    state = tiles.spread(advanced, setup, state, first, steps)
     finite = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
     return state, observe(state), jnp.stack(finite).all()
 
@@ -194,6 +200,7 @@ def _saved_frames(
     scene: Scene,
     observe: Callable[[State], Any],
     every: int,
+    devices: int,
 ) -> SavedFrames:
     """What a checkpoint's folder has of this simulation."""
     state, work, observed = start(scene), None, None
@@ -202,7 +209,7 @@ def _saved_frames(
         # the same name, and another state of this package.
         at, bare, programs = jnp.int32(0), replace(scene, phases=()), []
         for phase in scene.phases:
-            setup = _prepare(bare, phase.effects)
+            setup = _prepare(bare, phase.effects, devices)
             programs.append(_frame.lower(observe, setup, state, at, at).as_text())
         observed = jax.eval_shape(observe, state)
         work = {"scene": scene, "steps": every, "programs": programs, "observed": str(observed)}
@@ -214,7 +221,12 @@ Failure = tuple[Phase | None, Setup | None, State, int, int]
 
 
 def _interruptible(
-    scene: Scene, observe: Callable[[State], Any], every: int, progress: bool, saved: SavedFrames
+    scene: Scene,
+    observe: Callable[[State], Any],
+    every: int,
+    progress: bool,
+    saved: SavedFrames,
+    devices: int,
 ) -> tuple[list[Any], bool, Failure | None]:
     """Frame by frame, with a progress bar, until the end, Ctrl-C or a value that is not finite."""
     total = sum(phase.steps(scene.dt) for phase in scene.phases)
@@ -232,7 +244,7 @@ def _interruptible(
             for steps in _frame_steps(phase, every, scene.dt):
                 number += 1
                 if number >= kept[0]:
-                    setup = setup or _prepare(bare, phase.effects)
+                    setup = setup or _prepare(bare, phase.effects, devices)
                     before = kept[1]
                     state, observed, sound = _frame(
                         observe, setup, before, jnp.int32(first), jnp.int32(steps)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxhair import bonds as bond
-from jaxhair import check, rods
+from jaxhair import check, rods, tiles
 from jaxhair.effects import (
     BondEffect,
     Effect,
@@ -35,12 +35,16 @@ from jaxhair.strands import State, strands_last
 
 @pytree
 class Setup:
-    """What a step needs besides the state: the same for all steps of a phase."""
+    """What a step needs besides the state: the same for all steps of a phase.
+
+    devices: that the strands are spread over.
+    """
 
     rod: Rod
     effects: tuple[Effect, ...]
     solver: Solver
     dt: float = static()
+    devices: int = static(default=1)
 
 
 def step(setup: Setup, state: State, time: Array) -> State:
@@ -143,7 +147,7 @@ def posed(setup: Setup, state: State) -> State:
     return State(p, still[0], q, state.shapes, state.fractions, still[1])
 
 
-def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
+def prepare(scene: Scene, effects: tuple[Effect, ...], devices: int = 1) -> Setup:
     """What stays the same during a phase with the given effects."""
     strands = scene.strands
     lengths = strands_last(strands.lengths)[:, None]
@@ -180,7 +184,7 @@ def prepare(scene: Scene, effects: tuple[Effect, ...]) -> Setup:
         stiffness=k,
         material=of_fibre,
     )
-    return Setup(rod, effects, scene.solver, scene.dt)
+    return Setup(rod, effects, scene.solver, scene.dt, devices)
 
 
 def start(scene: Scene) -> State:
@@ -202,6 +206,17 @@ def start(scene: Scene) -> State:
 def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> State:
     """The state after `steps` steps, of which the first has the number `first` in its phase.
 
+    All steps of a tile of strands, then those of the next: see `jaxhair.tiles`.
+    """
+    advanced = partial(_advanced, steps=steps)
+    if steps == 1 and setup.devices == 1:  # one step for each tile gains nothing
+        return advanced(setup, state, jnp.asarray(first))
+    return tiles.spread(advanced, setup, state, jnp.asarray(first))
+
+
+def _advanced(setup: Setup, state: State, first: Array, *, steps: int) -> State:
+    """`advance` for strands that are simulated together.
+
     Two nested scans: in reverse mode about 2 sqrt(steps) states are stored, and each step is
     computed a second and third time instead.
     """
@@ -215,7 +230,7 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
         return lax.scan(jax.checkpoint(one, prevent_cse=False), carry, numbers)
 
     if steps == 1:  # such as a phase of a treatment; a third of the time to compile
-        return one((state, blank(setup, state)), jnp.asarray(first))[0][0]
+        return one((state, blank(setup, state)), first)[0][0]
     numbers = first + jnp.arange(steps)
     inner = _near_square_root(steps)
     outer = steps // inner
@@ -236,29 +251,37 @@ def _near_square_root(steps: int) -> int:
     return root
 
 
-@partial(jax.jit, static_argnames="steps")
-def phase_end(scene: Scene, effects: tuple[Effect, ...], state: State, *, steps: int) -> State:
+@partial(jax.jit, static_argnames=("steps", "devices"))
+def phase_end(
+    scene: Scene, effects: tuple[Effect, ...], state: State, *, steps: int, devices: int = 1
+) -> State:
     """The state after a phase. Phases that differ only in numbers share the compiled program.
 
     Arguments:
         scene: as arrays, without its phases, whose names would be compiled in.
     """
-    return advance(prepare(scene, effects), state, 0, steps=steps)
+    return advance(prepare(scene, effects, devices), state, 0, steps=steps)
 
 
-def run(scene: Scene) -> dict[str, State]:
+def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
     """The state at the end of each phase, by the phase's name.
+
+    devices: of `jax.local_devices()`, over which the strands are spread.
+
+    Raises ValueError for more devices than there are, and for several where an effect, such as
+    `HairContact`, couples strands.
 
     A pure function: `jax.jit`, `grad`, `jvp` and `vmap` work on it, in any leaf of the scene.
     Without an outer `jit`, phases with the same effects are compiled once.
     """
     check.instance("scene", scene, Scene)
+    devices = tiles.checked_devices(scene, devices)
     scene = scene.as_arrays()
     state = start(scene)
     bare = replace(scene, phases=())
     ends = {}
     for phase in scene.phases:
         steps = phase.steps(scene.dt)
-        state = phase_end(bare, phase.effects, state, steps=steps)
+        state = phase_end(bare, phase.effects, state, steps=steps, devices=devices)
         ends[phase.name] = state
     return ends

@@ -290,7 +290,7 @@ target = {"water set": Shape(test_many.observed())}
 one, two = (jax.devices()[:1], jax.devices())
 found = []
 for devices in (one, two):
-    jax.devices = lambda: devices
+    jax.local_devices = lambda: devices
     found.append(fit_each(test_many.scene(3), target, test_many.FREE, tile=1))
 test_many.same(*found)
 assert np.allclose(found[0].values[test_many.ROD], test_many.RODS, rtol=1e-4)
