@@ -1,6 +1,6 @@
 """Which edges of other strands are near which points, found in time linear in their number.
 
-Points are sorted along a curve that fills space (Morton's), so that each 32 of them in a row, a
+Points are sorted along a curve that fills space (Hilbert's), so that each 32 of them in a row, a
 block, lie close together, and so do the edges that start at them. Boxes around blocks, and around
 32 blocks, tell which blocks are near each other; only between those are distances computed.
 """
@@ -95,14 +95,35 @@ def _listed(true: Array) -> tuple[Array, Array]:
 
 
 def _along_the_curve(points: Array) -> Array:
-    """Morton's key of points (3, points): the bits of their coordinates, interleaved."""
+    """Where along Hilbert's curve points (3, points) are, by Skilling's algorithm.
+
+    J. Skilling, Programming the Hilbert curve, 2004 (DOI 10.1063/1.1751381); 10 bits a coordinate.
+    """
     low = jnp.nanmin(points, axis=1, keepdims=True)
     extent = jnp.nanmax(points - low)
     at = (points - low) * jnp.where(extent > 0, 1023 / jnp.where(extent > 0, extent, 1), 0)
-    x = jnp.where(jnp.isfinite(at), at, 0).astype(jnp.int32)
+
+    def turned(number: Array, x: tuple[Array, ...]) -> tuple[Array, ...]:
+        bit = jnp.int32(512) >> number.astype(jnp.int32)
+        first, rest = x[0], list(x)
+        for axis in range(3):
+            here = first if axis == 0 else rest[axis]
+            is_set = (here & bit) != 0
+            swapped = jnp.where(is_set, 0, (first ^ here) & (bit - 1))
+            first = first ^ jnp.where(is_set, bit - 1, swapped)
+            rest[axis] = here ^ swapped
+        return first, *rest[1:]
+
+    x, y, z = lax.fori_loop(0, 9, turned, tuple(jnp.where(jnp.isfinite(at), at, 0).astype("int32")))
+    y = x ^ y
+    z = y ^ z
+    flipped = jnp.zeros_like(z)
+    for bit in range(9, 0, -1):
+        flipped = jnp.where((z & 2**bit) != 0, flipped ^ (2**bit - 1), flipped)
+    bits = jnp.stack([x, y, z]) ^ flipped[None]
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        x = (x | (x << shift)) & mask
-    return x[0] | (x[1] << 1) | (x[2] << 2)
+        bits = (bits | (bits << shift)) & mask
+    return (bits[0] << 2) | (bits[1] << 1) | bits[2]
 
 
 Box = tuple[Array, Array]

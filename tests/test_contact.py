@@ -12,7 +12,7 @@ import pytest
 from jax import lax
 
 import jaxhair as jh
-from jaxhair.neighbours import near_pairs
+from jaxhair.neighbours import _along_the_curve, near_pairs
 from jaxhair.simulate import Setup, advance, blank, prepare, remembering_step, start
 
 # Relative to the largest push. Float32 rounds the direction between hairs that nearly coincide.
@@ -105,6 +105,13 @@ def test_pairs_are_those_of_a_search_by_brute_force(reach: float) -> None:
     assert int(found.number) == near.sum()
     places = np.stack([found.points, found.edges])[:, : near.sum()]
     np.testing.assert_array_equal(np.unique(places, axis=1), np.argwhere(near).T)
+
+
+def test_the_curve_visits_every_place_in_steps_of_one() -> None:
+    """Which is what makes it Hilbert's, and blocks of its points compact."""
+    grid = np.array(np.meshgrid(*3 * [np.arange(16.0)])).reshape(3, -1)
+    order = np.argsort(np.asarray(jax.jit(_along_the_curve)(jnp.asarray(grid))))
+    np.testing.assert_array_equal(np.abs(np.diff(grid[:, order])).sum(axis=0), 1)
 
 
 @partial(jax.jit, static_argnames="steps")
