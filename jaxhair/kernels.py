@@ -8,14 +8,18 @@ third of the time that it took without (`tests/benchmarks/peers.py`), and compil
 
 How: a call with the frontend attribute `xla_cpu_small_call`, which XLA gives to small loops by
 itself, is compiled as a single function. Not everything works inside; `_fits` knows what does.
-What does not fit is left as it was, and so are derivatives, for which XLA was seen to abort; other
-platforms; other versions of XLA than those tested; and everything under the environment variable
-JAXHAIR_KERNELS=off.
+What does not fit is left as it was, and so are derivatives; other platforms; other versions of XLA
+than those tested; everything under the environment variable JAXHAIR_KERNELS=off; and whatever is
+not inside of `allowed`. XLA was seen to abort the process on some programs with kernels, such as a
+loop that a user writes around a simulation: they are for programs that are the library's own from
+the outermost `jit` on, which its tests go through.
 """
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -84,9 +88,22 @@ def _touched(arguments: Any) -> list[Array]:
     return [lax.slice(x, (0,) * x.ndim, (1,) * x.ndim) for x in arrays if x.size]
 
 
+_allowed = ContextVar("_allowed", default=False)
+
+
+@contextmanager
+def allowed(yes: bool = True) -> Iterator[None]:
+    """While a program is traced inside, functions are compiled as kernels."""
+    before = _allowed.set(yes)
+    try:
+        yield
+    finally:
+        _allowed.reset(before)
+
+
 def used() -> bool:
     """Whether functions are compiled as kernels here."""
-    on = os.environ.get("JAXHAIR_KERNELS", "on") != "off"
+    on = _allowed.get() and os.environ.get("JAXHAIR_KERNELS", "on") != "off"
     return on and jax.default_backend() == "cpu" and version.__version__ in TESTED
 
 

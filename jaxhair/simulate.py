@@ -24,7 +24,7 @@ from jaxhair.effects import (
     of_kind,
 )
 from jaxhair.fibre import Fibre, PhysicalFibre, material, stiffness
-from jaxhair.kernels import one_kernel
+from jaxhair.kernels import allowed, one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
@@ -251,16 +251,24 @@ def _near_square_root(steps: int) -> int:
     return root
 
 
-@partial(jax.jit, static_argnames=("steps", "devices"))
+@partial(jax.jit, static_argnames=("steps", "devices", "kernels"))
 def phase_end(
-    scene: Scene, effects: tuple[Effect, ...], state: State, *, steps: int, devices: int = 1
+    scene: Scene,
+    effects: tuple[Effect, ...],
+    state: State,
+    *,
+    steps: int,
+    devices: int = 1,
+    kernels: bool = False,
 ) -> State:
     """The state after a phase. Phases that differ only in numbers share the compiled program.
 
     Arguments:
         scene: as arrays, without its phases, whose names would be compiled in.
+        kernels: see `jaxhair.kernels.allowed`.
     """
-    return advance(prepare(scene, effects, devices), state, 0, steps=steps)
+    with allowed(kernels):
+        return advance(prepare(scene, effects, devices), state, 0, steps=steps)
 
 
 def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
@@ -272,16 +280,18 @@ def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
     `HairContact`, couples strands.
 
     A pure function: `jax.jit`, `grad`, `jvp` and `vmap` work on it, in any leaf of the scene.
-    Without an outer `jit`, phases with the same effects are compiled once.
+    Without an outer `jit`, phases with the same effects are compiled once, and on a CPU into
+    kernels, with which a step takes half to a third of the time; see `jaxhair.kernels`.
     """
     check.instance("scene", scene, Scene)
     devices = tiles.checked_devices(scene, devices)
     scene = scene.as_arrays()
     state = start(scene)
+    kernels = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, state)))
     bare = replace(scene, phases=())
     ends = {}
     for phase in scene.phases:
         steps = phase.steps(scene.dt)
-        state = phase_end(bare, phase.effects, state, steps=steps, devices=devices)
+        state = phase_end(bare, phase.effects, state, steps=steps, devices=devices, kernels=kernels)
         ends[phase.name] = state
     return ends

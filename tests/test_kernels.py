@@ -1,6 +1,6 @@
 """Functions compiled as one kernel: the same values and derivatives, and what fits inside."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,14 @@ from jaxhair.simulate import phase_end, start
 CLOSE = {"float32": 2e-6, "float64": 1e-14}
 MARK = "xla_cpu_small_call"
 
-pytestmark = pytest.mark.skipif(not kernels.used(), reason="no kernels on this platform or jaxlib")
+with kernels.allowed():
+    pytestmark = pytest.mark.skipif(not kernels.used(), reason="none on this platform or jaxlib")
+
+
+@pytest.fixture(autouse=True)
+def _allowed() -> Iterator[None]:
+    with kernels.allowed():
+        yield
 
 
 def chain(pair: dict[str, Array], scale: Array) -> dict[str, Array]:
@@ -159,7 +166,7 @@ def lowered_phase(
     phase = jh.Phase("phase", 0.1, effects)
     scene = jh.Scene(hair, phases=(phase,), solver=solver).as_arrays()
     bare = replace(scene, phases=())
-    return phase_end.lower(bare, scene.phases[0].effects, start(scene), steps=4)
+    return phase_end.lower(bare, scene.phases[0].effects, start(scene), steps=4, kernels=True)
 
 
 def step_call(lowered: Any) -> str:
@@ -196,6 +203,48 @@ def test_what_others_add_stays_outside() -> None:
     text = lowered_phase((FromOutside(),), jh.PositionBased(), strands=16, points=9).as_text()
     assert "call @step" not in text
     assert MARK in text
+
+
+@pytest.mark.parametrize("kind", ["carried", "computed", "constant"])
+def test_an_argument_that_xla_finds_not_needed(kind: str) -> None:
+    """XLA aborts on kernels with such arguments unless something keeps them in use."""
+    kernel = one_kernel(lambda x, i: x * 2 + (i * 0).astype(x.dtype)[None])
+    ones, whole = jnp.ones((8, 16)), jnp.arange(16)
+
+    @jax.jit
+    def repeated(ones: Array, whole: Array) -> Array:
+        def one(carry: Any, _: None) -> tuple[Any, None]:
+            x, i = carry
+            given = {"carried": i, "computed": i * 3 + 1, "constant": jnp.arange(16)}[kind]
+            return (kernel(x, given), i + 1), None
+
+        return lax.scan(one, (ones, whole), None, length=3)[0][0]
+
+    assert MARK in repeated.lower(ones, whole).as_text()
+    np.testing.assert_array_equal(repeated(ones, whole), 8 * ones)
+
+
+def test_programs_of_users_have_none() -> None:
+    """A loop around a simulation, for which XLA would abort, and anything else that is traced."""
+    scene = jh.scenes.perm(strands=4, winding=False, contact=False).first(0.05)
+
+    def total(x: Array) -> Array:
+        changed = jh.replace_leaves(scene, {"bonds.influence": x * jnp.array([0.3, 0.3, 0.2, 0.2])})
+        return jnp.sum(jh.run(changed)["released"].positions)
+
+    @jax.jit
+    def looped(x: Array, n: Array) -> Array:
+        def more(carry: Any) -> Any:
+            return carry[0] + 1, total(x * (1 + 0 * carry[0]))
+
+        return lax.while_loop(lambda carry: carry[0] < n, more, (0, jnp.zeros_like(x)))[1]
+
+    one = jnp.asarray(1.0, scene.dtype)
+    with kernels.allowed(False):
+        assert MARK not in looped.lower(one, jnp.asarray(3)).as_text()
+        assert MARK not in jax.jit(lambda: jh.run(scene)).lower().as_text()
+        found = float(looped(one, jnp.asarray(3)))
+    assert found == pytest.approx(float(total(one)), rel=1e-5)
 
 
 def test_kernels_can_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -292,8 +292,7 @@ found = fit_each(test_many.scene(3), target, test_many.FREE, tile=1)
 assert np.allclose(found.values[test_many.ROD], test_many.RODS, rtol=1e-4)
 with mock.patch("jax.local_devices", lambda: jax.devices()[:1]):
     alone = fit_each(test_many.scene(3), target, test_many.FREE, tile=1)
-for name, values in alone.values.items():
-    assert np.allclose(found.values[name], values, rtol=1e-9)
+test_many.same(found, alone)
 """
 
 

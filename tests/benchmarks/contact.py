@@ -146,7 +146,7 @@ def in_scenes(repeats: int) -> None:
             made, skin = memory_after(prepare(bare, phase.effects), state, 60)
             print(f"  {name:<9} {phase.name:<12} {taken[0]:9.3f}   {taken[1]:12.3f}   "
                   f"{60 / made:12.1f}   {1e3 * skin:9.1f}", flush=True)  # fmt: skip
-            state = phase_end(bare, phase.effects, state, steps=phase.steps(scene.dt))
+            state = phase_end(bare, phase.effects, state, steps=phase, kernels=True.steps(scene.dt))
 
 
 @partial(jax.jit, static_argnames="steps")

@@ -49,7 +49,7 @@ def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tup
     effects, state, bare = built.phases[0].effects, start(built), replace(built, phases=())
     steps = int(np.clip(400_000 / (strands * points), 20, 100))
     begin = time.perf_counter()
-    run = jax.jit(lambda *x: phase_end(*x, steps=steps), compiler_options=options)
+    run = jax.jit(lambda *x: phase_end(*x, steps=steps, kernels=True), compiler_options=options)
     program = run.lower(bare, effects, state).compile()
     compilation = time.perf_counter() - begin
     times = []
