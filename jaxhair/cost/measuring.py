@@ -211,7 +211,9 @@ class _Bench:
         leaves, tree = jax.tree.flatten((variant.scene, variant.effects))
         key = tree, tuple(np.shape(leaf) for leaf in leaves)
         if key not in self.programs:
-            self.programs[key] = self.compiled(phase_end.lower, variant, steps=self.steps, kernels=True)
+            self.programs[key] = self.compiled(
+                phase_end.lower, variant, steps=self.steps, kernels=True
+            )
         return self.programs[key]
 
     def compiled(self, lower: Callable[..., Any], variant: Variant, **options: int) -> _Program:
