@@ -104,7 +104,7 @@ def _along_the_curve(points: Array) -> Array:
     at = (points - low) * jnp.where(extent > 0, 1023 / jnp.where(extent > 0, extent, 1), 0)
 
     def turned(number: Array, x: tuple[Array, ...]) -> tuple[Array, ...]:
-        bit = jnp.int32(512) >> number.astype(jnp.int32)
+        bit = jnp.int32(512) >> jnp.asarray(number, jnp.int32)
         first, rest = x[0], list(x)
         for axis in range(3):
             here = first if axis == 0 else rest[axis]

@@ -77,7 +77,7 @@ def test_operations_of_a_step_are_those_of_its_unrolled_program(solver: Any) -> 
     """XLA's own count of the program without loops."""
     hair = jh.Strands.straight(np.ones((20, 3)), (0.0, 0.0, -1.0), length=0.12, points=POINTS)
     scene, state = bare(jh.Scene(hair, solver=solver))
-    effects = (*HELD, jh.HairContact(), jh.Floor(-0.1), jh.Cut(hydrogen=0.5, rate=0.1))
+    effects = (*HELD, jh.Floor(-0.1), jh.Cut(hydrogen=0.5, rate=0.1))
     setup = prepare(scene, effects)
     with jax.disable_jit():  # loops run in Python
         program = jax.make_jaxpr(lambda setup, s: advance(setup, s, 0, steps=1))(setup, state)
