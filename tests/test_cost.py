@@ -75,7 +75,7 @@ def test_operations_of_hand_counted_programs() -> None:
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
 def test_operations_of_a_step_are_those_of_its_unrolled_program(solver: Any) -> None:
     """XLA's own count of the program without loops."""
-    hair = jh.Strands.straight(np.ones((20, 3)), (0.0, 0.0, -1.0), length=0.12, points=POINTS)
+    hair = jh.Strands.straight(np.ones((200, 3)), (0.0, 0.0, -1.0), length=0.12, points=POINTS)
     scene, state = bare(jh.Scene(hair, solver=solver))
     effects = (*HELD, jh.Floor(-0.1), jh.Cut(hydrogen=0.5, rate=0.1))
     setup = prepare(scene, effects)
