@@ -74,7 +74,8 @@ def test_operations_of_hand_counted_programs() -> None:
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
 def test_operations_of_a_step_are_those_of_its_unrolled_program(solver: Any) -> None:
-    """XLA's own count of the program without loops."""
+    """XLA's own count of the program without loops. That leaves out what the last round of a loop
+    makes for a next one: the compliant solver's multipliers, the direct one's next block."""
     hair = jh.Strands.straight(np.ones((200, 3)), (0.0, 0.0, -1.0), length=0.12, points=POINTS)
     scene, state = bare(jh.Scene(hair, solver=solver))
     effects = (*HELD, jh.Floor(-0.1), jh.Cut(hydrogen=0.5, rate=0.1))
@@ -86,7 +87,8 @@ def test_operations_of_a_step_are_those_of_its_unrolled_program(solver: Any) -> 
     analysis = unrolled.cost_analysis()
     assert analysis is not None
     found = operations.of_a_step(scene, effects, state)
-    assert found == pytest.approx(analysis["flops"], rel=LOOP_COUNTERS)
+    last_round = 0.05 if solver.compliant else 0.0
+    assert found == pytest.approx(analysis["flops"], rel=LOOP_COUNTERS + last_round)
 
 
 def test_operations_of_effects_counted_by_hand() -> None:
