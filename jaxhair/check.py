@@ -22,6 +22,11 @@ _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 4
 _REPR.maxstring = _REPR.maxlong = _REPR.maxother = 60
 
 
+def traced(tree: Any) -> bool:
+    """Whether some number of a pytree belongs to a program that JAX traces."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def known(value: Any) -> np.ndarray | None:
     """Numbers as a float64 array, or None where they are traced and have no value yet."""
     return None if isinstance(value, jax.core.Tracer) else np.asarray(value, float)

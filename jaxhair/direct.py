@@ -186,7 +186,7 @@ def _shortened(rod: Rod, unit: Units, p: Array, n: Array) -> Array:
     edge = p[1:] - p[:-1]
     allowed = rod.lengths / unit.length * (1.1 + unit.compliance * quat.safe_norm(n))
     excess = jnp.maximum(quat.safe_norm(edge) - allowed, 0) * quat.unit(edge)
-    pulled = padded(lax.associative_scan(jnp.add, excess), 1, 0)
+    pulled = padded(lax.associative_scan(jnp.add, excess), 1, 0)  # `cumsum` fits no kernel
     w = rod.point_weights
     free = w > 0
     mass = jnp.where(free, 1 / jnp.where(free, w, 1), 1e6)

@@ -40,6 +40,14 @@ def of_kind(effects: Iterable[Effect], kind: type[T]) -> tuple[T, ...]:
     return tuple(effect for effect in effects if isinstance(effect, kind))
 
 
+def names(effects: Iterable[Effect]) -> list[str]:
+    """What effects of a phase go by: their classes; the second of one class is "Hold2"."""
+    kinds = [type(effect).__name__ for effect in effects]
+    return [
+        kind + (str(n + 1) if (n := kinds[:i].count(kind)) else "") for i, kind in enumerate(kinds)
+    ]
+
+
 class VelocityEffect(Effect):
     """Changes velocities: gravity, wind, drag, hair against hair."""
 

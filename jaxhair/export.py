@@ -1,6 +1,7 @@
 """A recording as a file: arrays, strands, a picture or a movie, by the file's ending."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,20 @@ def check_new(path: str | os.PathLike[str], *, overwrite: bool) -> None:
             raise Enough
     except Enough:
         pass
+
+
+def check_new_folder(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
+    """Makes the folder `--output` and raises what writing files into it would raise, before any
+    work is done; where one exists, without making the folder."""
+    paths = [folder / name for name in names]
+    for path in paths:
+        if not overwrite and os.path.lexists(path):
+            raise FileExistsError(
+                f"{path} exists: --output must be another folder, or add --overwrite"
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in paths:
+        check_new(path, overwrite=overwrite)
 
 
 def check_drawing(path: str | os.PathLike[str], size: int) -> None:

@@ -108,7 +108,7 @@ def simulate(
     devices = tiles.checked_devices(scene, devices)
     numbers = scene.as_arrays()
     times, names = _frame_times(scene, every)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scene)):
+    if check.traced(scene):
         if checkpoint is not None:
             raise ValueError(
                 f"checkpoint is {checkpoint!r}; under a JAX transformation it must be None"

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxhair import check
 from jaxhair.bonds import Bonds
-from jaxhair.effects import Effect, of_kind
+from jaxhair.effects import Effect, names, of_kind
 from jaxhair.fibre import Fibre, PhysicalFibre
 from jaxhair.forces import TipForce
 from jaxhair.holding import Wound
@@ -238,8 +238,7 @@ def _parts(path: tuple[Any, ...], scene: Scene) -> Iterator[str]:
             inside_phase = item
             yield item.name
         elif isinstance(item, Effect) and inside_phase is not None:
-            alike = [type(e) for e in inside_phase.effects[: key.idx]].count(type(item))
-            yield type(item).__name__ + ("" if alike == 0 else str(alike + 1))
+            yield names(inside_phase.effects)[key.idx]
         else:
             yield str(key.idx)
         here = item

@@ -287,7 +287,7 @@ def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
     devices = tiles.checked_devices(scene, devices)
     scene = scene.as_arrays()
     state = start(scene)
-    kernels = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, state)))
+    kernels = not check.traced((scene, state))
     bare = replace(scene, phases=())
     ends = {}
     for phase in scene.phases:

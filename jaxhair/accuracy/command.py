@@ -17,7 +17,7 @@ from jaxhair.accuracy.grid import Plan
 from jaxhair.accuracy.measuring import Row, measure
 from jaxhair.accuracy.problem import PARAMETERS, Reference, reference
 from jaxhair.accuracy.stretch import Stretch, stretch
-from jaxhair.export import check_new
+from jaxhair.export import check_new_folder
 from jaxhair.extras import optional
 from jaxhair.output import new_file
 
@@ -56,14 +56,7 @@ def run(options: argparse.Namespace) -> int:
     plan = grid.plan(strands=options.strands, quick=options.quick)
     optional("matplotlib")
     folder = Path(options.output)
-    for path in (folder / name for name in FILES):
-        if not options.overwrite and os.path.lexists(path):
-            raise FileExistsError(
-                f"{path} exists: --output must be another folder, or add --overwrite"
-            )
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
-        check_new(folder / name, overwrite=options.overwrite)
+    check_new_folder(folder, FILES, overwrite=options.overwrite)
     results = _measured(plan, progress=not options.quiet)
     if results.reference is None or not results.rows:
         print("interrupted: nothing was measured yet", file=sys.stderr)

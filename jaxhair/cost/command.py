@@ -2,14 +2,14 @@
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
 from jaxhair.cost import table
 from jaxhair.cost.measuring import SceneCost, measured
-from jaxhair.export import check_new
+from jaxhair.export import check_new_folder
+from jaxhair.extras import optional
 from jaxhair.output import new_file
 from jaxhair.scene import Scene
 
@@ -46,7 +46,8 @@ def run(options: argparse.Namespace, scene: Scene) -> int:
     """Runs the command; returns 0, or 130 if it was interrupted."""
     folder = None if options.output is None else Path(options.output)
     if folder is not None:
-        _check(folder, overwrite=options.overwrite)
+        optional("matplotlib")
+        check_new_folder(folder, FILES, overwrite=options.overwrite)
     try:
         cost = measured(
             scene,
@@ -63,21 +64,6 @@ def run(options: argparse.Namespace, scene: Scene) -> int:
         written = _write(cost, options.scene, folder, overwrite=options.overwrite)
         print("wrote " + ", ".join(map(str, written)), file=sys.stderr if options.json else None)
     return 0
-
-
-def _check(folder: Path, *, overwrite: bool) -> None:
-    """Raises what writing would raise, before anything is measured."""
-    from jaxhair.extras import optional
-
-    optional("matplotlib")
-    for path in (folder / name for name in FILES):
-        if not overwrite and os.path.lexists(path):
-            raise FileExistsError(
-                f"{path} exists: --output must be another folder, or add --overwrite"
-            )
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
-        check_new(folder / name, overwrite=overwrite)
 
 
 def _write(cost: SceneCost, name: str, folder: Path, *, overwrite: bool) -> list[Path]:

@@ -7,6 +7,7 @@ from jax import Array
 
 from jaxhair.cost import operations
 from jaxhair.effects import Effect, PoseEffect, of_kind
+from jaxhair.effects import names as names_of
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.scene import Scene
@@ -66,14 +67,6 @@ class StillPose(PoseEffect):
         return state.positions, state.orientations
 
 
-def effect_names(effects: tuple[Effect, ...]) -> list[str]:
-    """Names of effects: their classes; the second of one class is "Hold2"."""
-    kinds = [type(effect).__name__ for effect in effects]
-    return [
-        kind + (str(n + 1) if (n := kinds[:i].count(kind)) else "") for i, kind in enumerate(kinds)
-    ]
-
-
 @dataclass(frozen=True)
 class Plan:
     """What is measured of a phase, and how its parts follow from it.
@@ -102,7 +95,7 @@ def plan(scene: Scene, effects: tuple[Effect, ...], state: State) -> Plan:
     Arguments:
         scene: as arrays, without phases. state: that its steps take.
     """
-    names = effect_names(effects)
+    names = names_of(effects)
     posed = bool(of_kind(effects, PoseEffect))  # a pose takes the solver's place
     idle = replace(scene, solver=_stand_in(scene.solver, solves=False))
     given = replace(scene, solver=_stand_in(scene.solver, solves=True))

@@ -8,8 +8,6 @@ repeats, compilation apart.
 
 import argparse
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,20 +24,10 @@ from jaxhair.simulate import Setup, blank, phase_end, prepare, remembering_step,
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import all_pairs
+from measure import wall_times
 
 DT = 1 / 360
 CONTACT = jh.HairContact(radius=1e-3, strength=20.0)
-
-
-def least_seconds(run: Callable[[], Any], times: int) -> float:
-    """Least wall time of a call, after one that compiles."""
-    jax.block_until_ready(run())
-    taken = []
-    for _ in range(times):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        taken.append(time.perf_counter() - begin)
-    return min(taken)
 
 
 def patch(strands: int, points: int = 9) -> jh.Scene:
@@ -114,11 +102,11 @@ def alone(sizes: list[int], steps: int, repeats: int) -> None:
         setup, state = prepare(scene, scene.phases[0].effects), start(scene)
         found = pushes(setup, state, steps)
         few = repeats if strands < 5000 else 2
-        taken = 1e3 * least_seconds(partial(pushes, setup, state, steps), few) / steps
+        taken = 1e3 * min(wall_times(partial(pushes, setup, state, steps), few)) / steps
         times.append(taken)
         pairs = ratio = "-"
         if strands <= 600:
-            slow = least_seconds(partial(pushes, setup, state, 4, True), 3) * 1e3 / 4
+            slow = min(wall_times(partial(pushes, setup, state, 4, True), 3)) * 1e3 / 4
             pairs, ratio = f"{slow:.2f}", f"{slow / taken:.1f}"
         made = int(found[2].builds)
         off = difference(state, steps, found)
@@ -141,12 +129,13 @@ def in_scenes(repeats: int) -> None:
             taken = []
             free = tuple(e for e in phase.effects if not isinstance(e, jh.HairContact))
             for effects in (free, phase.effects):
-                run = partial(phase_end, bare, effects, state, steps=60)
-                taken.append(1e3 * least_seconds(run, repeats) / 60)
+                run = partial(phase_end, bare, effects, state, steps=60, kernels=True)
+                taken.append(1e3 * min(wall_times(run, repeats)) / 60)
             made, skin = memory_after(prepare(bare, phase.effects), state, 60)
             print(f"  {name:<9} {phase.name:<12} {taken[0]:9.3f}   {taken[1]:12.3f}   "
                   f"{60 / made:12.1f}   {1e3 * skin:9.1f}", flush=True)  # fmt: skip
-            state = phase_end(bare, phase.effects, state, steps=phase, kernels=True.steps(scene.dt))
+            steps = phase.steps(scene.dt)
+            state = phase_end(bare, phase.effects, state, steps=steps, kernels=True)
 
 
 @partial(jax.jit, static_argnames="steps")

@@ -15,6 +15,7 @@ import numpy as np
 
 import jaxhair as jh
 from jaxhair import tiles
+from jaxhair.kernels import allowed
 from jaxhair.simulate import advance, prepare, start
 
 SIZES = ((200, 9), (10_000, 9), (1_000, 100))
@@ -35,7 +36,7 @@ def steps(strands: int, points: int, devices: int, whole: bool) -> tuple[Callabl
         return advance(prepare(scene, EFFECTS, devices), start(scene), 0, steps=number)
 
     tiling = (lambda strands, points: (1, strands)) if whole else tiles.tiling
-    with mock.patch.object(tiles, "tiling", tiling):
+    with mock.patch.object(tiles, "tiling", tiling), allowed():
         compiled = jax.jit(end).lower(scene).compile()
     if devices > 1:  # where the program wants them
         scene = jax.device_put(scene, compiled.input_shardings[0][0])

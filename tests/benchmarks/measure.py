@@ -17,15 +17,20 @@ import jaxhair as jh
 from jaxhair.simulate import phase_end, start
 
 
-def seconds(run: Callable[[], Any], times: int = 5) -> float:
-    """Median wall time of a call, after one that compiles."""
+def wall_times(run: Callable[[], Any], times: int) -> list[float]:
+    """Of calls [s], after one that compiles."""
     jax.block_until_ready(run())
     taken = []
     for _ in range(times):
         begin = time.perf_counter()
         jax.block_until_ready(run())
         taken.append(time.perf_counter() - begin)
-    return float(np.median(taken))
+    return taken
+
+
+def seconds(run: Callable[[], Any], times: int = 5) -> float:
+    """Median wall time of a call, after one that compiles."""
+    return float(np.median(wall_times(run, times)))
 
 
 def stretch(points: int, edge: float, iterations: int) -> float:
