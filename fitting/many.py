@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from fitting import tiles
@@ -156,10 +157,12 @@ def fit_each(
             `fitting.fit`, the same fit goes on from there to the same result bit for bit.
 
     Tiles go to `jax.local_devices()` in turn. A strand that has converged is simulated no more.
+    With `jax.distributed` each process, all of which must make the same call, simulates its share
+    of the strands and gets the fits of all.
 
     Raises ValueError for an unknown phase or leaf, a leaf that cannot differ between strands,
     targets of other numbers than points, hair that touches hair, and a checkpoint that is of other
-    work or damaged.
+    work, damaged or of several processes.
     """
     check.instance("scene", scene, Scene)
     check.whole("steps", steps, least=1)
@@ -174,6 +177,10 @@ def fit_each(
     start = np.concatenate([tiles.numbers(p) for p in parameters], axis=1)
     journal = None
     if checkpoint is not None:
+        if jax.process_count() > 1:
+            raise ValueError(
+                f"checkpoint is {check.short(checkpoint)}; it must be None with several processes"
+            )
         journal = Checkpoints(checkpoint, _work(problem, (steps, tolerance, prior_width)))
     found = levenberg_marquardt(
         problem,

@@ -12,6 +12,7 @@ from jax import Array
 
 from fitting.constraints import Constraint
 from fitting.parameters import OWN_AXES, check_alike, check_free, matching, unknown
+from fitting.processes import shared
 from fitting.targets import MM, Shape, Target
 from jaxhair import Scene, check, named_leaves, run
 from jaxhair.strands import strands_last
@@ -238,10 +239,15 @@ class Tiles:
     def evaluate(self, x: np.ndarray, strands: np.ndarray) -> "Squares":
         """Sums over the residuals of the named strands, in float64.
 
-        The products are made here: in float32 they would lose what the data hardly determine.
-
         Arguments:
             x: free numbers, shape (strands, n). strands: their places in the scene.
+        """
+        return shared(lambda few: self._evaluated(x[few], strands[few]), np.arange(len(strands)))
+
+    def _evaluated(self, x: np.ndarray, strands: np.ndarray) -> "Squares":
+        """`evaluate` for a process's share.
+
+        The products are made here: in float32 they would lose what the data hardly determine.
         """
         n, count = x.shape[1], len(strands)
         square, slope, curvature = np.empty(count), np.empty((count, n)), np.empty((count, n, n))

@@ -274,7 +274,8 @@ def phase_end(
 def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
     """The state at the end of each phase, by the phase's name.
 
-    devices: of `jax.local_devices()`, over which the strands are spread.
+    devices: of `jax.devices()`, over which the strands are spread; with `jax.distributed` all of
+        them, or 1, each process's own.
 
     Raises ValueError for more devices than there are, and for several where an effect, such as
     `HairContact`, couples strands.

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxhair import check
 from jaxhair.effects import Effect
@@ -38,15 +38,21 @@ def couples(effects: Iterable[Effect]) -> Effect | None:
 def checked_devices(scene: "Scene", devices: int) -> int:
     """The number of devices to simulate a scene on.
 
-    Raises ValueError for more than there are, and for several where an effect couples strands.
+    Raises ValueError for more than there are, for some of those of several processes but not all,
+    and for several where an effect couples strands.
     """
     check.whole("devices", devices, least=1)
-    there = jax.local_devices()
+    there = jax.devices()
     if devices > len(there):
         more = 'jax.config.update("jax_num_cpu_devices", n) before JAX computes anything gives n'
         raise ValueError(
             f"devices is {devices}; it must be at most {len(there)}, which JAX has"
             + (f" ({more})" if there[0].platform == "cpu" else "")
+        )
+    if jax.process_count() > 1 and devices not in (1, len(there)):
+        raise ValueError(
+            f"devices is {devices}; with {jax.process_count()} processes it must be 1, each "
+            f"process's own, or {len(there)}, those of all"
         )
     for phase in scene.phases if devices > 1 else ():
         if (effect := couples(phase.effects)) is not None:
@@ -77,13 +83,16 @@ def spread(
 
     Arrays whose last axis has the strands' number are cut there: all of the state's, and those
     of rod, effects and solver that have a value for each strand. The last tile and device repeat
-    the last strand. As a whole where an effect couples strands.
+    the last strand. As a whole where an effect couples strands. Where several processes share
+    the devices, each gets all that was computed.
     """
     arguments = setup, state, *shared
     if couples(setup.effects) is not None:
         return advanced(*arguments)
     strands = state.positions.shape[-1]
-    devices = min(setup.devices, -(-strands // LANES))
+    processes, devices = jax.process_count(), setup.devices
+    if processes == 1:  # of several, all must take part
+        devices = min(devices, -(-strands // LANES))
     if devices == 1:
         return _by_tiles(advanced, setup, state, *shared)
     leaves, tree, own = _flat(arguments, strands)
@@ -92,14 +101,18 @@ def spread(
     def share(*leaves: Array) -> "State":
         return _by_tiles(advanced, *jax.tree.unflatten(tree, leaves))
 
+    mesh = Mesh(np.array(jax.devices()[:devices]), ("strands",))
     found = jax.shard_map(
         share,
-        mesh=Mesh(np.array(jax.local_devices()[:devices]), ("strands",)),
+        mesh=mesh,
         in_specs=tuple(_cut_last(x, cut) for x, cut in zip(leaves, own, strict=True)),
         out_specs=jax.tree.map(lambda x: _cut_last(x, True), state),
         check_vma=False,
     )(*(_padded(x, size) if cut else x for x, cut in zip(leaves, own, strict=True)))
-    return jax.tree.map(lambda x: x[..., :strands], found)
+    found = jax.tree.map(lambda x: x[..., :strands], found)
+    if processes > 1:
+        found = lax.with_sharding_constraint(found, NamedSharding(mesh, PartitionSpec()))  # type: ignore[no-untyped-call]
+    return found
 
 
 def _cut_last(x: Any, cut: bool) -> Any:
