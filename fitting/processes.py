@@ -30,4 +30,4 @@ def shared(evaluate: Callable[[np.ndarray], Arrays], strands: np.ndarray) -> Arr
         gathered = np.asarray(multihost_utils.process_allgather(raw, tiled=True))
         return gathered[: len(strands)].copy().view(x.dtype).reshape(-1, *x.shape[1:])
 
-    return type(found)(*(of_all(x) for x in found))
+    return found._make(of_all(x) for x in found)

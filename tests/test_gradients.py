@@ -1,6 +1,7 @@
 """Derivatives of a final curl, end to end, in both modes, against central differences."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -132,3 +133,23 @@ def test_contact_may_be_left_out_of_gradients() -> None:
     assert values[0] == values[1] > 1e-3
     assert slopes[0] > 1e-9
     assert slopes[1] == 0
+
+
+@pytest.mark.slow  # compilation of long scans takes half a minute
+def test_memory_of_reverse_mode_grows_as_the_root_of_the_steps() -> None:
+    """As XLA plans it; at most steps^0.6, of which states that are kept make 0.5."""
+    start = jh.Scene(hair(64), solver=jh.PositionBased(iterations=1)).as_arrays()
+    effects = (jh.Gravity(), jh.Drag(2.8), jh.Hold())
+
+    def height(scene: jh.Scene, steps: int) -> jax.Array:
+        phase = jh.Phase("fall", steps * STEPS, effects)
+        return jnp.sum(jh.run(replace(scene, phases=(phase,)))["fall"].positions[:, 2])
+
+    few, many = 16**2, 64**2
+    planned = [
+        jax.jit(jax.grad(height), static_argnums=1).lower(start, n).compile().memory_analysis()
+        for n in (few, many)
+    ]
+    sizes = [plan.temp_size_in_bytes for plan in planned]
+    assert sizes[0] > 1e5
+    assert np.log(sizes[1] / sizes[0]) / np.log(many / few) <= 0.6

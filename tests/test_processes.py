@@ -31,11 +31,11 @@ def test_what_processes_cannot_do_is_refused(tmp_path: Path) -> None:
     scene = jh.Scene(hair, phases=(jh.Phase("fall", 0.01, (jh.Gravity(), jh.Hold())),))
     targets = {"fall": fitting.Shape(np.zeros((2, 5, 3)))}
     free = {"fibre.stiffness": fitting.Interval(0.0, 0.5)}
-    with mock.patch.object(jax, "process_count", lambda: 2):
-        with pytest.raises(ValueError, match="checkpoint is .*several processes"):
+    with mock.patch.object(jax, "process_count", return_value=2):
+        with pytest.raises(ValueError, match=r"checkpoint is .*several processes"):
             fitting.fit_each(scene, targets, free, checkpoint=tmp_path / "kept")
         with (
-            mock.patch.object(jax, "devices", lambda: 4 * jax.local_devices()),
-            pytest.raises(ValueError, match="devices is 2; with 2 processes it must be 1.* or 4"),
+            mock.patch.object(jax, "devices", return_value=4 * jax.local_devices()),
+            pytest.raises(ValueError, match=r"devices is 2; with 2 processes it must be 1.* or 4"),
         ):
             jh.run(scene, devices=2)

@@ -3,9 +3,9 @@
     python tests/benchmarks/scale_out.py --processes 2 --devices 2
 
 starts the processes, joins them by `jax.distributed`, and compares with one process of one device:
-the stiffness of 50 falling strands fitted by `fitting.fit_each`, and their film on all devices, both
-uneven shares. On several machines, call `jax.distributed.initialize()` in each and the same
-functions.
+the stiffness of 50 falling strands fitted by `fitting.fit_each`, and their film on all devices,
+both with uneven shares. On several machines, call `jax.distributed.initialize()` in each, and the
+same functions.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def started(
         environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
         running.append(subprocess.Popen([str(x) for x in command], env=environment))
     try:
-        if any([process.wait(timeout=600) for process in running]):
+        if max(process.wait(timeout=600) for process in running) > 0:
             raise SystemExit("a process failed")
     finally:
         for process in running:
