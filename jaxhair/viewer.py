@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxhair import check, pictures, viewer_data
+from jaxhair.export import meshes
 from jaxhair.interpolation import Interpolation
 from jaxhair.raster import View
 from jaxhair.recording import Recording
@@ -187,8 +188,6 @@ def _shown(
     recording: Recording, points: np.ndarray, kept: np.ndarray, origin: np.ndarray
 ) -> list[list[float]]:
     """Lowest and highest corner of what must be seen at first, from `origin`."""
-    from jaxhair.export import meshes
-
     there = [meshes(recording.scene, recording.phases[i], float(recording.times[i])) for i in kept]
     return [(corner - origin).tolist() for corner in pictures.box(points[kept], there, np.eye(3))]
 

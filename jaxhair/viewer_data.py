@@ -19,9 +19,6 @@ from jaxhair.strands import BONDS
 
 Array = np.ndarray
 
-COLORS = (*BONDS, "strain", "curvature")
-"""What the hair's colour can show."""
-
 STEPS = 65535
 """Steps of a position along an axis of the box: 16 bits."""
 
@@ -79,7 +76,7 @@ def hair(recording: Recording) -> tuple[Array, Array]:
 
 
 def colored(recording: Recording, points: Array) -> dict[str, Colored]:
-    """By the names of `COLORS`; without the bonds if their fractions were not recorded."""
+    """By the names of `jaxhair.export.COLORS`; without bonds if they were not recorded."""
     found = {}
     fractions = recording.observed.get("fractions")
     if fractions is not None:
@@ -156,14 +153,16 @@ def of_frames(name: str, whole: Array) -> dict[str, Array]:
 
 def of_hairs(grown: Interpolation) -> dict[str, Array]:
     """How hairs are interpolated between strands, one row of numbers a hair: see
-    `Interpolation`; the order is that of viewer_data.js."""
-    hairs = len(grown.guide)
+    `Interpolation`; the order is that of viewer_data.js. The strands themselves come first, then
+    another hair of each, and so on: the first of them stand for all."""
+    hairs, strands = len(grown.guide), int(grown.guide[-1]) + 1
     pairs = [np.zeros((hairs, 2)), np.zeros((hairs, 2))]
     for pair, given in zip(pairs, (grown.neighbours, grown.weights), strict=True):
         pair[:, : given.shape[1]] = given
     columns = [grown.guide[:, None], *pairs, grown.offset]
     columns += [x[:, None] for x in (grown.clumping, grown.cut, grown.shade)]
-    return {"hairs": np.concatenate(columns, 1).astype("<f4")}
+    rows = np.concatenate(columns, 1).reshape(strands, hairs // strands, -1)
+    return {"hairs": np.swapaxes(rows, 0, 1).reshape(hairs, -1).astype("<f4")}
 
 
 def obstacles(

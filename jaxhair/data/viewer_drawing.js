@@ -16,12 +16,12 @@ vec3 screen(vec3 c) { return pow(clamp(c, 0., 1.), vec3(1. / 2.2)); }
 float lit(vec3 place, float bias) {
   vec3 p = (light * vec4(place, 1.)).xyz * .5 + .5;
   float sum = 0.;
-  for (int i = 0; i < 9; i++) {
-    vec2 at = p.xy + vec2(i % 3 - 1, i / 3 - 1) * 2.2 / ${MAP}.;
+  for (int i = 0; i < 5; i++) {
+    vec2 at = p.xy + (i < 4 ? vec2(i % 2, i / 2) - .5 : vec2(0)) * 5. / ${MAP}.;
     float behind = (p.z - texture(shade, at).r) * 4. - bias;
     sum += exp(-max(behind, 0.) * 22.);
   }
-  return sum / 9.;
+  return sum / 5.;
 }`;
 
 const HAIR_VERTEX = `#version 300 es
@@ -142,7 +142,7 @@ function createDrawing(canvas, of) {
   const radius = Math.max(size, 1e-4);
   const boxMiddle = of.box[0].map((x, k) => (x + of.box[1][k]) / 2);
   const hairs = of.arrays.hairs.length / 11;
-  const pieces = Math.max(1, Math.min(8, Math.ceil(64 / (of.points - 1))));
+  const pieces = Math.max(1, Math.min(8, Math.ceil(48 / (of.points - 1))));
 
   const each = new Float32Array(hairs * 3);
   for (let i = 0; i < hairs; i++) {
@@ -190,7 +190,14 @@ function createDrawing(canvas, of) {
   const lamp = direction(of.view.azimuth - 0.75, Math.min(0.35 * of.view.elevation + 0.75, 1.4));
   const light = parallel(boxMiddle, lamp, radius);
   const width = radius / 320; // [m] of a hair, as drawn
-  let frame = 0, field = null, placed = [];
+  const least = of.strands / hairs;
+  let frame = 0, field = null, placed = [], share = 1;
+
+  // The first `part` of the hairs stand for all; they are drawn wider.
+  function setShare(part) {
+    share = Math.min(Math.max(part, least), 1);
+    return share;
+  }
 
   function setFrame(newFrame, newField, stops) {
     frame = newFrame;
@@ -230,7 +237,7 @@ function createDrawing(canvas, of) {
   function all(hairProgram, shapeProgram, seen) {
     const about = field && of.fields[field];
     const uniforms = {
-      ...seen, lamp, light, radius, width, background: BACKGROUND, color: of.color,
+      ...seen, lamp, light, radius, width: width / share ** 0.5, background: BACKGROUND, color: of.color,
       middle: boxMiddle, hairs: 0, shade: 1, ramp: 2, points: of.points, pieces,
       plain: !about, flatEdges: Boolean(about && about.edges),
     };
@@ -249,10 +256,15 @@ function createDrawing(canvas, of) {
     hairProgram.use(uniforms);
     gl.bindVertexArray(hairArray);
     const vertices = 2 * ((of.points - 1) * pieces + 1);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, vertices, hairs);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, vertices, Math.ceil(hairs * share));
   }
 
-  return { gl, setFrame, draw, radius };
+  // Returns when all is drawn.
+  function wait() {
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  return { setShare, setFrame, draw, wait, radius };
 }
 
 function program(gl, vertex, fragment) {

@@ -28,6 +28,7 @@ async function main() {
   const last = of.times.length - 1;
   const state = { frame: of.frame, field: of.colorBy, playing: null, camera: null };
   let drawing = null, canvas = null, pending = 0, changed = true;
+  let busy = false, share = 1, rest = 0;
 
   // A new canvas each time, because one whose context is lost stays blank.
   function open() {
@@ -70,7 +71,7 @@ async function main() {
     for (let corner = 0; corner < 8; corner++) {
       const place = [0, 1, 2].map((k) => of.box[(corner >> k) & 1][k] - middle[k]);
       for (const [axis, tan] of [[right, HALF_TAN * aspect], [up, HALF_TAN]]) {
-        needed = Math.max(needed, (1.12 * Math.abs(dot(place, axis))) / tan + dot(place, back));
+        needed = Math.max(needed, (1.06 * Math.abs(dot(place, axis))) / tan + dot(place, back));
       }
     }
     return { azimuth, elevation, target: [...middle], distance: distance || needed };
@@ -82,14 +83,34 @@ async function main() {
   function drawNow() {
     pending = 0;
     if (!drawing) return;
+    const start = performance.now();
+    drawing.setShare(busy ? share : 1);
     if (changed) drawing.setFrame(state.frame, state.field, state.field && rampOf(state.field));
     changed = false;
     const { target, distance } = state.camera, towards = back();
     drawing.draw(target.map((x, k) => x + distance * towards[k]), target);
     showScale();
+    if (busy) adapt(start);
   }
 
-  function redraw() {
+  // While something moves, as many hairs are drawn as can be in a twenty-fifth of a second, which
+  // matters without a graphics card; a moment later all of them.
+  function adapt(start) {
+    drawing.wait();
+    const took = performance.now() - start;
+    if (took > 40 || (took < 20 && share < 1)) {
+      share = drawing.setShare(share * Math.min(Math.max(30 / took, 0.2), 1.5));
+    }
+    clearTimeout(rest);
+    rest = setTimeout(() => {
+      busy = false;
+      changed = true;
+      redraw();
+    }, 250);
+  }
+
+  function redraw(moves = false) {
+    busy ||= moves;
     if (!pending) pending = requestAnimationFrame(drawNow);
   }
 
@@ -148,7 +169,10 @@ async function main() {
       const time = playing.from + (now - playing.since) / 1000;
       let frame = state.frame;
       while (frame < last && of.times[frame + 1] <= time + 1e-6) frame += 1;
-      if (frame !== state.frame) showFrame(frame);
+      if (frame !== state.frame) {
+        showFrame(frame);
+        redraw(true);
+      }
       if (frame === last) play(false);
       else requestAnimationFrame(next);
     });
@@ -168,7 +192,7 @@ async function main() {
     state.camera.azimuth -= dx * 0.008;
     const up = state.camera.elevation + dy * 0.008, most = Math.PI / 2 - 1e-3;
     state.camera.elevation = Math.min(Math.max(up, -most), most);
-    redraw();
+    redraw(true);
   }
 
   function move(dx, dy) {
@@ -176,14 +200,14 @@ async function main() {
     state.camera.target = state.camera.target.map(
       (x, k) => x + by * (dy * up[k] - dx * right[k]),
     );
-    redraw();
+    redraw(true);
   }
 
   function zoom(factor) {
     const radius = drawing ? drawing.radius : 1;
     const distance = state.camera.distance * factor;
     state.camera.distance = Math.min(Math.max(distance, 0.05 * radius), 50 * radius);
-    redraw();
+    redraw(true);
   }
 
   // One pointer turns or moves; two move, and zoom by how far apart they are.
@@ -235,6 +259,7 @@ async function main() {
   slider.addEventListener("input", () => {
     play(false);
     showFrame(Number(slider.value));
+    redraw(true);
   });
   select.addEventListener("change", () => showField(select.value));
 
@@ -248,14 +273,17 @@ async function main() {
   showFrame(of.frame);
   new ResizeObserver(() => canvas && resize()).observe(stage);
 
-  // For tests and measurements: time [ms] to show a frame, or to show the same one once more.
+  // For tests and measurements: whether all is drawn, and the time [ms] to show a frame with all
+  // hairs, or to show the same one once more.
   globalThis.jaxhair = {
     state,
+    settled: () => Boolean(drawing) && !pending && !busy && !state.playing,
+    share: () => share,
     milliseconds(frame) {
-      const { gl } = drawing, start = performance.now();
+      const start = performance.now();
       if (frame !== undefined) showFrame(frame);
       drawNow();
-      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits for all
+      drawing.wait();
       return performance.now() - start;
     },
   };
