@@ -70,7 +70,7 @@ async function main() {
     let needed = 1e-3;
     for (let corner = 0; corner < 8; corner++) {
       const place = [0, 1, 2].map((k) => of.box[(corner >> k) & 1][k] - middle[k]);
-      for (const [axis, tan] of [[right, HALF_TAN * aspect], [up, HALF_TAN]]) {
+      for (const [axis, tan] of [[right, HALF_TAN * aspect], [up, 0.92 * HALF_TAN]]) {
         needed = Math.max(needed, (1.06 * Math.abs(dot(place, axis))) / tan + dot(place, back));
       }
     }
