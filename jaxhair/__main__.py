@@ -212,6 +212,9 @@ def _simulate(options: argparse.Namespace) -> int:
     check.whole("--devices", options.devices, least=1)
     if options.devices > 1:
         _split_cpu(options.devices)
+    drawing: dict[str, Any] = {}
+    if ending in PICTURES:
+        drawing["size"] = (options.size, options.size)
     failed = False
     try:
         recording = simulate(
@@ -239,7 +242,7 @@ def _simulate(options: argparse.Namespace) -> int:
                 color_by=options.color_by,
                 overwrite=options.overwrite,
                 progress=not options.quiet,
-                **({"size": (options.size, options.size)} if ending in PICTURES else {}),
+                **drawing,
             )
         except (ValueError, OSError, ImportError) as error:
             if not failed:
