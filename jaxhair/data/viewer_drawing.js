@@ -264,7 +264,11 @@ function createDrawing(canvas, of) {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
-  return { setShare, setFrame, draw, wait, radius };
+  const names = gl.getExtension("WEBGL_debug_renderer_info");
+  const card = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  const slow = /swiftshader|llvmpipe|software|basic render/i.test(card);
+
+  return { setShare, setFrame, draw, wait, radius, slow };
 }
 
 function program(gl, vertex, fragment) {

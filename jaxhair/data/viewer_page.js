@@ -49,6 +49,7 @@ async function main() {
       say("The browser has dropped this picture, as it does where many are open. "
         + "Click to draw it again.", open);
     });
+    if (drawing.slow) share = drawing.setShare(0.1);
     changed = true;
     resize();
   }
