@@ -27,25 +27,27 @@ float lit(vec3 place, float bias) {
 const HAIR_VERTEX = `#version 300 es
 precision highp float;
 precision highp sampler2D;
-uniform sampler2D hairs;
+uniform sampler2D hairs, each; // each: last point, where it is cut off (in points), shade
 uniform int points, pieces;
 uniform mat4 camera;
 uniform vec4 eye; // w = 0: a direction, for the light
 uniform float width, pixel;
 uniform bool flatEdges;
-layout(location = 0) in vec3 hair; // last point, where it is cut off (in points), shade
 out vec3 place, tangent;
 out float across, level, along, tint;
-vec4 at(int i) {
-  int k = gl_InstanceID * points + clamp(i, 0, int(hair.x));
-  return texelFetch(hairs, ivec2(k % ${ROW}, k / ${ROW}), 0);
-}
+vec4 fetch(sampler2D from, int k) { return texelFetch(from, ivec2(k % ${ROW}, k / ${ROW}), 0); }
 void main() {
-  int last = int(hair.x);
-  float u = min(float(gl_VertexID >> 1) / float(pieces), hair.y);
+  // All hairs are one strip, joined by triangles without area, since instances are slow without a
+  // graphics card.
+  int corners = 2 * ((points - 1) * pieces + 1), which = gl_VertexID / (corners + 2);
+  int corner = clamp(gl_VertexID % (corners + 2) - 1, 0, corners - 1);
+  vec4 hair = fetch(each, which);
+  int last = int(hair.x), first = which * points;
+  float u = min(float(corner >> 1) / float(pieces), hair.y);
   int i = min(int(u), last - 1);
   float t = u - float(i);
-  vec4 before = at(i - 1), start = at(i), end = at(i + 1), after = at(i + 2);
+  vec4 before = fetch(hairs, first + max(i - 1, 0)), start = fetch(hairs, first + i);
+  vec4 end = fetch(hairs, first + i + 1), after = fetch(hairs, first + min(i + 2, last));
   vec3 chord = (end - start).xyz;
   vec3 leave = (end - before).xyz / 2., arrive = (after - start).xyz / 2.;
   // at the ends, the parabola through three points keeps the curl
@@ -59,7 +61,7 @@ void main() {
   vec3 towards = eye.w == 0. ? eye.xyz : eye.xyz - place;
   vec3 side = cross(tangent, towards);
   side = dot(side, side) > 0. ? normalize(side) : vec3(0);
-  across = float(gl_VertexID & 1) * 2. - 1.;
+  across = float(corner & 1) * 2. - 1.;
   along = u / float(last);
   tint = hair.z;
   float fine = eye.w == 0. ? pixel : pixel * length(towards);
@@ -144,17 +146,14 @@ function createDrawing(canvas, of) {
   const hairs = of.arrays.hairs.length / 11;
   const pieces = Math.max(1, Math.min(8, Math.ceil(48 / (of.points - 1))));
 
-  const each = new Float32Array(hairs * 3);
+  const eachRows = Math.ceil(hairs / ROW), about = new Float32Array(eachRows * ROW * 4);
   for (let i = 0; i < hairs; i++) {
     const row = of.arrays.hairs.subarray(i * 11, i * 11 + 11), last = of.arrays.counts[row[0]] - 1;
-    each.set([last, last * Math.max(1 - row[9], 0.05), row[10]], 3 * i);
+    about.set([last, last * Math.max(1 - row[9], 0.05), row[10], 0], 4 * i);
   }
-  const hairArray = gl.createVertexArray();
-  gl.bindVertexArray(hairArray);
-  buffer(gl, gl.ARRAY_BUFFER, each);
-  gl.enableVertexAttribArray(0);
-  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-  gl.vertexAttribDivisor(0, 1);
+  const each = texture(gl, gl.NEAREST);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, ROW, eachRows);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, eachRows, gl.RGBA, gl.FLOAT, about);
 
   const shapes = [];
   for (let i = 0; `shape${i}_vertices` in of.arrays; i++) {
@@ -238,15 +237,15 @@ function createDrawing(canvas, of) {
     const about = field && of.fields[field];
     const uniforms = {
       ...seen, lamp, light, radius, width: width / share ** 0.5, background: BACKGROUND, color: of.color,
-      middle: boxMiddle, hairs: 0, shade: 1, ramp: 2, points: of.points, pieces,
+      middle: boxMiddle, hairs: 0, shade: 1, ramp: 2, each: 3, points: of.points, pieces,
       plain: !about, flatEdges: Boolean(about && about.edges),
     };
     // the map cannot be read while it is drawn
-    for (const [unit, of] of [hairTexture, "camera" in seen && seen.eye[3] ? shade : null, ramp]
-      .entries()) {
+    const textures = [hairTexture, seen.eye[3] ? shade : null, ramp, each];
+    textures.forEach((bound, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, of);
-    }
+      gl.bindTexture(gl.TEXTURE_2D, bound);
+    });
     shapeProgram.use(uniforms);
     for (const [shape, ...offset] of placed) {
       shapeProgram.use({ offset });
@@ -254,9 +253,9 @@ function createDrawing(canvas, of) {
       gl.drawElements(gl.TRIANGLES, shapes[shape].count, gl.UNSIGNED_INT, 0);
     }
     hairProgram.use(uniforms);
-    gl.bindVertexArray(hairArray);
-    const vertices = 2 * ((of.points - 1) * pieces + 1);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, vertices, Math.ceil(hairs * share));
+    gl.bindVertexArray(null);
+    const corners = 2 * ((of.points - 1) * pieces + 1) + 2;
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, corners * Math.ceil(hairs * share));
   }
 
   // Returns when all is drawn.

@@ -28,6 +28,7 @@ async function main() {
   const last = of.times.length - 1;
   const state = { frame: of.frame, field: of.colorBy, playing: null, camera: null };
   let drawing = null, canvas = null, pending = 0, changed = true;
+  const pointers = new Map();
   let busy = false, share = 1, rest = 0;
 
   // A new canvas each time, because one whose context is lost stays blank.
@@ -102,16 +103,23 @@ async function main() {
     if (took > 40 || (took < 20 && share < 1)) {
       share = drawing.setShare(share * Math.min(Math.max(30 / took, 0.2), 1.5));
     }
+    rest = setTimeout(settle, 250);
+  }
+
+  function settle() {
     clearTimeout(rest);
-    rest = setTimeout(() => {
-      busy = false;
-      changed = true;
-      redraw();
-    }, 250);
+    if (pointers.size || state.playing) {
+      rest = setTimeout(settle, 250);
+      return;
+    }
+    busy = false;
+    changed = true;
+    redraw();
   }
 
   function redraw(moves = false) {
     busy ||= moves;
+    if (moves) clearTimeout(rest);
     if (!pending) pending = requestAnimationFrame(drawNow);
   }
 
@@ -212,7 +220,6 @@ async function main() {
   }
 
   // One pointer turns or moves; two move, and zoom by how far apart they are.
-  const pointers = new Map();
   stage.addEventListener("pointerdown", (event) => {
     stage.setPointerCapture(event.pointerId);
     stage.focus({ preventScroll: true });
