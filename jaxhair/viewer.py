@@ -1,6 +1,6 @@
 """A recording to turn, zoom and play, in a notebook or as a web page in one file.
 
-The page draws with WebGL 2 by code of its own (data/viewer_*.js, 20 kB). three.js was measured
+The page draws with WebGL 2 by code of its own (data/viewer_*.js, 30 kB). three.js was measured
 beside it: version 0.187, only the parts that are needed and minified, is 560 kB, which every view
 of a notebook would hold again, and npm's package has no minified file, so that a bundler would be
 needed to make one. The shaders, which are most of the code, would be the same.
