@@ -17,6 +17,7 @@ from jaxhair.scene import Phase, Scene, named_leaves, replace_leaves
 from jaxhair.simulate import run
 from jaxhair.solvers import Compliant, PositionBased
 from jaxhair.strands import BONDS, State, Strands
+from jaxhair.viewer import view
 
 __all__ = [
     "BONDS",
@@ -59,5 +60,6 @@ __all__ = [
     "scenes",
     "simulate",
     "treatments",
+    "view",
     "write_curves",
 ]

@@ -13,11 +13,18 @@ from jaxhair import check, scenes
 from jaxhair.accuracy import command as accuracy
 from jaxhair.cost import command as cost
 from jaxhair.direct import Direct
-from jaxhair.export import check_drawing, check_ending, check_new, save
+from jaxhair.export import (
+    COLORS,
+    PICTURES,
+    check_color,
+    check_drawing,
+    check_ending,
+    check_new,
+    save,
+)
 from jaxhair.recording import NotFinite, simulate
 from jaxhair.scene import Scene
 from jaxhair.solvers import SWEEPS, Compliant, PositionBased, Solver
-from jaxhair.strands import BONDS
 from jaxhair.treatments import wash
 
 
@@ -31,14 +38,19 @@ def parser() -> argparse.ArgumentParser:
         "simulate",
         help="simulate one of the paper's scenes",
         description="Simulates a scene and writes arrays (.npz), the last frame's strands (.hair, "
-        ".data), a picture of it (.png) or a movie (.gif, .mp4).",
+        ".data), a picture of it (.png), a movie (.gif, .mp4) or a web page to turn and play it "
+        "(.html).",
         epilog="example: python -m jaxhair simulate perm --rod-diameter 60mm --output perm.gif",
     )
     _add_scene(run)
     run.add_argument("--output", required=True, metavar="FILE", help="file to write")
     run.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
     run.add_argument("--fps", type=float, default=30.0, help="frames a second (30)")
-    run.add_argument("--color-by", choices=BONDS, help="show a bonded fraction, blue 0 to red 1")
+    run.add_argument(
+        "--color-by",
+        choices=COLORS,
+        help="show a bonded fraction, blue 0 to red 1; in .html also strain, curvature",
+    )
     run.add_argument("--size", type=int, default=800, help="of pictures, pixels (800)")
     run.add_argument(
         "--checkpoint",
@@ -193,12 +205,16 @@ def _split_cpu(devices: int) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    check_ending(options.output)
+    ending = check_ending(options.output)
+    check_color(options.output, options.color_by)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
     check.whole("--devices", options.devices, least=1)
     if options.devices > 1:
         _split_cpu(options.devices)
+    drawing: dict[str, Any] = {}
+    if ending in PICTURES:
+        drawing["size"] = (options.size, options.size)
     failed = False
     try:
         recording = simulate(
@@ -226,7 +242,7 @@ def _simulate(options: argparse.Namespace) -> int:
                 color_by=options.color_by,
                 overwrite=options.overwrite,
                 progress=not options.quiet,
-                size=(options.size, options.size),
+                **drawing,
             )
         except (ValueError, OSError, ImportError) as error:
             if not failed:

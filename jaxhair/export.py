@@ -17,7 +17,12 @@ from jaxhair.recording import Recording
 from jaxhair.scene import Scene, named_leaves
 from jaxhair.strands import BONDS
 
-ENDINGS = (".npz", ".hair", ".data", ".png", ".gif", ".mp4")
+COLORS = (*BONDS, "strain", "curvature")
+"""What the colour of the hair can show: the bonded fraction of a kind of bond, an edge's length
+over its rest length less 1, or curvature [1/m]."""
+
+ENDINGS = (".npz", ".hair", ".data", ".png", ".gif", ".mp4", ".html")
+PICTURES = (".png", ".gif", ".mp4")
 
 
 def save(
@@ -41,12 +46,14 @@ def save(
     | `.hair .data`  | the strands of one frame                                                 |
     | `.png`         | a picture of one frame                                                   |
     | `.gif .mp4`    | a movie; needs the extra `pictures`, as `.png` does                      |
+    | `.html`        | a web page to turn, zoom and play the hair, in one file; `view` says how |
 
     Arguments:
-        frame: for what holds one frame; the last.
-        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures.
+        frame: for what holds one frame, and the one that a web page shows first; the last.
+        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures; a web
+            page can show "strain" and "curvature" too.
         overwrite: replace a file that exists. progress: show a bar for movies.
-        drawing: options of `jaxhair.pictures.Options`.
+        drawing: options of `jaxhair.pictures.Options`; for a web page those of `view`.
 
     Raises ValueError for another ending, kind or frame, and FileExistsError.
     """
@@ -56,14 +63,19 @@ def save(
     check.whole("frame", frame, least=-frames, most=frames - 1)
     check.flag("overwrite", overwrite)
     check.flag("progress", progress)
-    if color_by is not None:
-        check.choice("color_by", color_by, BONDS)
+    check_color(path, color_by)
     counts = recording.scene.strands.counts
     if ending == ".npz":
         write_arrays(path, as_arrays(recording), overwrite=overwrite)
     elif ending in (".hair", ".data"):
         curves = Curves(recording.positions[frame], counts)
         write_curves(path, curves, overwrite=overwrite)
+    elif ending == ".html":
+        from jaxhair.viewer import view
+
+        page = view(recording, color_by=color_by, frame=frame, **drawing).page
+        with new_file(path, overwrite=overwrite) as temporary:
+            temporary.write_text(page, encoding="utf-8")
     else:
         _draw(path, recording, frame, color_by, overwrite, progress, drawing)
 
@@ -75,6 +87,12 @@ def check_ending(path: str | os.PathLike[str]) -> str:
         shown = check.short(Path(path).name)
         raise ValueError(f"output is {shown}; its name must end in {', '.join(ENDINGS)}")
     return ending
+
+
+def check_color(path: str | os.PathLike[str], color_by: str | None) -> None:
+    """Raises ValueError unless a file of the path's ending can show `color_by`, or it is None."""
+    if color_by is not None:
+        check.choice("color_by", color_by, COLORS if check_ending(path) == ".html" else BONDS)
 
 
 def check_new(path: str | os.PathLike[str], *, overwrite: bool) -> None:
@@ -111,7 +129,7 @@ def check_drawing(path: str | os.PathLike[str], size: int) -> None:
     extra `pictures`.
     """
     ending = check_ending(path)
-    if ending not in (".png", ".gif", ".mp4"):
+    if ending not in PICTURES:
         return
     check.whole("size", size, least=16)
     if ending == ".mp4" and size % 2:

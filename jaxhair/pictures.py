@@ -301,7 +301,7 @@ def _stage(
 ) -> shading.Stage:
     """The camera for `view` and a light, such that all hair of all frames is seen and lit."""
     towards = raster.axes_towards(view.azimuth, view.elevation)
-    low, high = _box(frames, meshes, towards)
+    low, high = box(frames, meshes, towards)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-4)
     centre = towards.T @ ((low + high) / 2)
     target = centre if view.target is None else np.asarray(view.target, float)
@@ -319,7 +319,7 @@ def _stage(
     return shading.Stage(camera, light, centre, radius)
 
 
-def _box(frames: Array, meshes: Sequence[Sequence[Mesh]], axes: Array) -> tuple[Array, Array]:
+def box(frames: Array, meshes: Sequence[Sequence[Mesh]], axes: Array) -> tuple[Array, Array]:
     """Lowest and highest coordinates along `axes` of all hair and of the smaller obstacles."""
     hair = [frame.reshape(-1, 3) @ axes.T for frame in frames]
     low = np.min([places.min(0) for places in hair], 0)
