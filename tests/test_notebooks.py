@@ -9,7 +9,13 @@ import matplotlib
 import pytest
 
 ROOT = Path(__file__).parent.parent
+PAGES = sorted((ROOT / "notebooks").glob("*.md"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def blocks(path: Path) -> list[str]:
+    """The Python in a page."""
+    return re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
 
 
 def run(code: str) -> None:
@@ -45,10 +51,26 @@ def test_readme_python_runs(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len(blocks) == 2
-    for code in blocks:
-        run(code)
+    (code,) = blocks(ROOT / "README.md")
+    run(code)
     assert (tmp_path / "perm.gif").stat().st_size > 10_000
     assert "converged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", [p for p in PAGES if blocks(p)], ids=lambda path: path.stem)
+def test_python_of_pages_runs(
+    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for code in blocks(path):
+        run(code)
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *PAGES], ids=lambda path: path.stem)
+def test_links_of_pages_lead_somewhere(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    found = re.findall(r"\]\(([^)#]+)[^)]*\)|src=\"([^\"]+)\"", text)
+    links = [a or b for a, b in found]
+    assert links or path.stem not in ("README", "model")
+    for link in links:
+        assert (path.parent / link).exists(), link
