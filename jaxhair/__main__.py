@@ -13,7 +13,7 @@ from jaxhair import check, scenes
 from jaxhair.accuracy import command as accuracy
 from jaxhair.cost import command as cost
 from jaxhair.direct import Direct
-from jaxhair.export import check_drawing, check_ending, check_new, save
+from jaxhair.export import DRAWN, check_drawing, check_ending, check_new, save
 from jaxhair.recording import NotFinite, simulate
 from jaxhair.scene import Scene
 from jaxhair.solvers import SWEEPS, Compliant, PositionBased, Solver
@@ -30,8 +30,9 @@ def parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "simulate",
         help="simulate one of the paper's scenes",
-        description="Simulates a scene and writes arrays (.npz), the last frame's strands (.hair, "
-        ".data), a picture of it (.png) or a movie (.gif, .mp4).",
+        description="Simulates a scene and writes arrays (.npz), the animation for other programs "
+        "(.usdc, .usda, .usd), the last frame's strands (.hair, .data), a picture of it (.png) or "
+        "a movie (.gif, .mp4).",
         epilog="example: python -m jaxhair simulate perm --rod-diameter 60mm --output perm.gif",
     )
     _add_scene(run)
@@ -193,7 +194,9 @@ def _split_cpu(devices: int) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    check_ending(options.output)
+    drawing: dict[str, Any] = {}
+    if check_ending(options.output) in DRAWN:
+        drawing["size"] = (options.size, options.size)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
     check.whole("--devices", options.devices, least=1)
@@ -226,7 +229,7 @@ def _simulate(options: argparse.Namespace) -> int:
                 color_by=options.color_by,
                 overwrite=options.overwrite,
                 progress=not options.quiet,
-                size=(options.size, options.size),
+                **drawing,
             )
         except (ValueError, OSError, ImportError) as error:
             if not failed:

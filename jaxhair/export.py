@@ -1,4 +1,4 @@
-"""A recording as a file: arrays, strands, a picture or a movie, by the file's ending."""
+"""A recording as a file: arrays, USD, strands, a picture or a movie, by the file's ending."""
 
 import os
 from collections.abc import Iterable
@@ -17,7 +17,9 @@ from jaxhair.recording import Recording
 from jaxhair.scene import Scene, named_leaves
 from jaxhair.strands import BONDS
 
-ENDINGS = (".npz", ".hair", ".data", ".png", ".gif", ".mp4")
+USD = (".usdc", ".usda", ".usd")
+DRAWN = (".png", ".gif", ".mp4")
+ENDINGS = (".npz", *USD, ".hair", ".data", *DRAWN)
 
 
 def save(
@@ -28,7 +30,7 @@ def save(
     color_by: str | None = None,
     overwrite: bool = False,
     progress: bool = False,
-    **drawing: Any,
+    **options: Any,
 ) -> None:
     """Writes a recording; the file's ending chooses how.
 
@@ -38,15 +40,19 @@ def save(
     |                | strands, points - 2, 4); `times` [s]; `phases`, of each frame; `counts`, |
     |                | points of each strand; `bonds`, the kinds; `scene`, as text; and every   |
     |                | number of the scene as `parameter:<name>`                                |
+    | `.usdc .usda   | animated BasisCurves with widths, colours and bonded fractions, and the  |
+    | .usd`          | obstacles, see `jaxhair.usd`; needs the extra `usd`                      |
     | `.hair .data`  | the strands of one frame                                                 |
     | `.png`         | a picture of one frame                                                   |
     | `.gif .mp4`    | a movie; needs the extra `pictures`, as `.png` does                      |
 
     Arguments:
         frame: for what holds one frame; the last.
-        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures.
+        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures
+            and USD.
         overwrite: replace a file that exists. progress: show a bar for movies.
-        drawing: options of `jaxhair.pictures.Options`.
+        options: of `jaxhair.usd.write` for USD: basis, width, color, unit, up; and of
+            `jaxhair.pictures.Options` for pictures and movies.
 
     Raises ValueError for another ending, kind or frame, and FileExistsError.
     """
@@ -64,8 +70,12 @@ def save(
     elif ending in (".hair", ".data"):
         curves = Curves(recording.positions[frame], counts)
         write_curves(path, curves, overwrite=overwrite)
+    elif ending in USD:
+        from jaxhair import usd
+
+        usd.write(path, recording, color_by=color_by, overwrite=overwrite, **options)
     else:
-        _draw(path, recording, frame, color_by, overwrite, progress, drawing)
+        _draw(path, recording, frame, color_by, overwrite, progress, options)
 
 
 def check_ending(path: str | os.PathLike[str]) -> str:
@@ -108,10 +118,12 @@ def check_drawing(path: str | os.PathLike[str], size: int) -> None:
     """Raises what drawing a square picture or movie would raise, before any work is done.
 
     ValueError for a size [pixels] that is too small, or odd for an .mp4; ImportError without the
-    extra `pictures`.
+    extra `pictures`, or for a USD file `usd`.
     """
     ending = check_ending(path)
-    if ending not in (".png", ".gif", ".mp4"):
+    if ending in USD:
+        optional("pxr.Usd", "usd")
+    if ending not in DRAWN:
         return
     check.whole("size", size, least=16)
     if ending == ".mp4" and size % 2:
