@@ -595,7 +595,7 @@ def test_the_command_line_writes_it(tmp_path: Path, capsys: pytest.CaptureFixtur
     path = tmp_path / "perm.usdc"
     small = ["--strands", "2", "--points", "17", "--prepared", "--no-contact", "--seconds", "0.1"]
     assert main(["simulate", "perm", *small, "--quiet", "--output", str(path)]) == 0
-    assert "perm.usdc: 4 frames" in capsys.readouterr().out
+    assert "perm.usdc: 6 frames" in capsys.readouterr().out
     assert jh.read_curves(path).points.shape == (2, 17, 3)
 
 
