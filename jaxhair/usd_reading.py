@@ -22,6 +22,12 @@ from jaxhair.file_formats import Counts, Points
 SECONDS = 600
 """After which a file is given up."""
 
+START = (
+    "import os, runpy, sys; sys.path += sys.argv.pop().split(os.pathsep); "
+    "runpy.run_path(sys.argv.pop(1), run_name='__main__')"
+)
+"""Finds packages where this process does, but none of its own modules in place of Python's."""
+
 
 def read(path: Path, *, frame: int, time: float | None) -> tuple[Points, Counts, float, str]:
     """Points in the file's unit and axes, shape (all points, 3), counts of the strands, the unit
@@ -36,16 +42,12 @@ def read(path: Path, *, frame: int, time: float | None) -> tuple[Points, Counts,
     """
     with path.open("rb"):
         pass
-    # -P: the program's folder has modules of this package, which are none of the other's
-    command = [sys.executable, "-P", usd_child.__file__, os.path.abspath(path), str(frame)]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
-        "OPENBLAS_NUM_THREADS": "1",  # none is needed, and each takes memory
-    }
+    given = [os.path.abspath(path), str(frame), "" if time is None else repr(float(time))]
+    command = [sys.executable, "-P", "-c", START, usd_child.__file__, *given]
     try:
         done = subprocess.run(
-            [*command, "" if time is None else repr(float(time))],
-            env=environment,
+            [*command, os.pathsep.join(p for p in sys.path if p)],
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # each thread takes memory
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=SECONDS,
@@ -55,6 +57,9 @@ def read(path: Path, *, frame: int, time: float | None) -> tuple[Points, Counts,
             f"it is not read within {SECONDS} s; it must be a valid USD file"
         ) from None
     line, _, data = done.stdout.partition(b"\n")
+    if done.returncode == 1:  # Python's own; a crash has another
+        why = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise RuntimeError(f"the process that reads USD files does not start: {why}")
     if done.returncode != 0 or not line:
         raise ValueError(
             "it is damaged: the USD library crashed over it, or asked for more memory than "

@@ -44,18 +44,18 @@ def draw(path: str) -> None:
     centre, size = Vector((low + high) / 2), float(np.linalg.norm(high - low))
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     away = Vector((0.5, -1.0, 0.25)).normalized()
-    camera.location = centre + 1.5 * size * away
+    camera.location = centre + 1.25 * size * away
     camera.rotation_euler = away.to_track_quat("Z", "Y").to_euler()
     camera.data.lens, camera.data.clip_start = 36, 0.01 * size  # hair is smaller than 0.1 m away
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-    sun.data.energy = 3.0
+    sun.data.energy = 2.0
     sun.rotation_euler = (0.6, 0.3, 0.2)
     for thing in (camera, sun):
         scene.collection.objects.link(thing)
     scene.camera = camera
     scene.world = bpy.data.worlds.new("world")
     scene.world.use_nodes = True
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.3, 0.3, 0.3, 1)
     scene.render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", 16
     scene.cycles.use_denoising = False
     scene.view_settings.view_transform = "Standard"

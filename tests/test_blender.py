@@ -93,7 +93,7 @@ def test_blender_has_colours_and_obstacles_and_draws(tmp_path: Path) -> None:
     Blender 5.0 does not import samples of visibility: it shows both obstacles in all frames.
     """
     of = recording()
-    jh.save(tmp_path / "hair.usdc", of, color_by="hydrogen", width=1e-3)
+    jh.save(tmp_path / "hair.usdc", of, color_by="hydrogen", width=2e-3)
     picture = os.environ.get("JAXHAIR_BLENDER_PICTURE") or str(tmp_path / "hair.png")
     found = blender(tmp_path / "hair.usdc", tmp_path, picture=picture)
     assert found["meshes"].tolist() == ["Floor", "Sphere"]

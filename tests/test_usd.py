@@ -2,6 +2,8 @@
 
 import json
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 import jaxhair as jh
 from fitting.__main__ import main as fit_main
+from jaxhair import usd_child
 from jaxhair.__main__ import main
 from jaxhair.usd_child import on_curve
 
@@ -618,18 +621,38 @@ def test_a_fit_takes_it_as_its_target(
     assert seen[0]["permed"].points[0] == pytest.approx(strand, abs=1e-7)
 
 
-def test_the_other_process_needs_no_package_of_ours() -> None:
-    """It starts in a fraction of the second that JAX takes."""
-    import subprocess
-    import sys
-
-    from jaxhair import usd_child
-
+def test_the_other_process_loads_no_package_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It starts in a fraction of the second that JAX takes; and a user's own module that is named
+    like one of Python's is not loaded in its place."""
     code = (
         "import sys, runpy, json; runpy.run_path(sys.argv[1]); "
         "print(json.dumps([m for m in sys.modules if m.split('.')[0] in ('jax', 'jaxhair')]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code, usd_child.__file__], capture_output=True, check=True
-    )
+    command = [sys.executable, "-P", "-c", code, usd_child.__file__]
+    done = subprocess.run(command, capture_output=True, check=True)
     assert json.loads(done.stdout) == []
+    (tmp_path / "json.py").write_text("raise SystemExit(3)")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    foreign(tmp_path / "a.usda")
+    assert len(jh.read_strands(tmp_path / "a.usda")) == 1
+
+
+def test_without_the_extra_the_command_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When reading as when writing, before the work."""
+    path = tmp_path / "a.usda"
+    foreign(path)
+    empty = tmp_path / "pxr"
+    empty.mkdir()
+    (empty / "__init__.py").write_text("raise ImportError('no pxr')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "pxr.Usd", None)
+    with pytest.raises(ImportError, match=r"USD files need pxr: pip install .jaxhair\[usd\]"):
+        jh.read_strands(path)
+    with pytest.raises(ImportError, match=r"jaxhair\[usd\]"):
+        jh.save(tmp_path / "b.usda", wavy())
+    assert main(["simulate", "perm", "--output", str(tmp_path / "b.usdc")]) == 2
+    assert not (tmp_path / "b.usda").exists()
