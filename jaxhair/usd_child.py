@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 MOST_POINTS = 10**8
-SPARE, RATIO = 2**32, 100  # bytes of memory, and those over the file's: files may refer to others
+SPARE, RATIO = 2**31, 100  # bytes of memory, and those over the file's: files may refer to others
 
 
 def on_curve(
@@ -218,6 +218,7 @@ def main() -> None:
         head = {"error": str(error)}
     except Exception as error:  # whatever the library raises
         text = next((s for s in map(str.strip, str(error).splitlines()) if s), "")
+        text = text.partition(" : ")[2] or text  # after the place in the library's source
         head = {"error": f"it is not readable as USD ({type(error).__name__}: {text[:200]})"}
     with answer:
         answer.write(json.dumps(head).encode() + b"\n")
