@@ -46,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
         "--target",
         nargs="+",
         metavar="FILE",
-        help="strands (.hair, .data, .npz), each as FILE or STATE=FILE with a STATE of "
+        help="strands (.hair, .data, .npz, USD), each as FILE or STATE=FILE with a STATE of "
         f"{', '.join(STATES)} (in this order if not named); or one .toml of measured curls",
     )
     add_strand_files(top)
@@ -75,7 +75,7 @@ def _measured(options: argparse.Namespace) -> Measured:
         return packaged()
     if len(options.target) == 1 and options.target[0].endswith(".toml"):
         return read(options.target[0])
-    unit = STRAND_UNITS[options.unit]
+    unit = None if options.unit is None else STRAND_UNITS[options.unit]
     observed: dict[str, Any] = {}
     unnamed = iter(STATES)
     for text in options.target:

@@ -13,8 +13,12 @@ STRAND_UNITS = {**UNITS, "inch": 0.0254}
 def add_strand_files(parser: argparse.ArgumentParser) -> None:
     """Options on the unit and the axes of strand files."""
     add = parser.add_argument
-    add("--unit", default="m", choices=tuple(STRAND_UNITS), help="of strand files (m)")
-    add("--up", default="z", choices=("y", "z"), help="axis of strand files (z)")
+    add(
+        "--unit",
+        choices=tuple(STRAND_UNITS),
+        help="of strand files (what a USD file says, m for others)",
+    )
+    add("--up", choices=("y", "z"), help="axis of strand files (what a USD file says, z)")
 
 
 def add_work(parser: argparse.ArgumentParser) -> None:

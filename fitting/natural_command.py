@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
         f"{STRANDS[STATE]} (as simulated) and {STRANDS[REMEMBERED]} (as they are remembered). "
         "example: python -m fitting natural head.hair --unit cm --up y --output natural",
     )
-    top.add_argument("file", metavar="FILE", help="strands as they hang: .hair, .data or .npz")
+    top.add_argument("file", metavar="FILE", help="strands as they hang: .hair, .data, .npz or USD")
     top.add_argument("--unloaded", metavar="FILE", help="the same strands without weight")
     add_strand_files(top)
     top.add_argument("--strands", type=int, help="how many to use at most, spread evenly (all)")
@@ -63,7 +63,7 @@ def _natural(options: argparse.Namespace) -> int:
             check.whole(f"--{name}", getattr(options, name), least=least)
     if options.unloaded is not None and options.no_weight:
         raise ValueError("--no-weight is for strands of one file; leave out it or --unloaded")
-    unit = STRAND_UNITS[options.unit]
+    unit = None if options.unit is None else STRAND_UNITS[options.unit]
     files = [options.file] + ([] if options.unloaded is None else [options.unloaded])
     seen = [read_strands(path, unit=unit, up=options.up) for path in files]
     folder = Path(options.output)
@@ -93,8 +93,8 @@ def _natural(options: argparse.Namespace) -> int:
         hair,
         found,
         folder,
-        unit=unit,
-        up=options.up,
+        unit=unit or 1.0,
+        up=options.up or "z",
         overwrite=options.overwrite,
         files=[str(path) for path in files],
     )

@@ -37,9 +37,9 @@ def parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "simulate",
         help="simulate one of the paper's scenes",
-        description="Simulates a scene and writes arrays (.npz), the last frame's strands (.hair, "
-        ".data), a picture of it (.png), a movie (.gif, .mp4) or a web page to turn and play it "
-        "(.html).",
+        description="Simulates a scene and writes arrays (.npz), the animation for other programs "
+        "(.usdc, .usda, .usd), the last frame's strands (.hair, .data), a picture of it (.png), a "
+        "movie (.gif, .mp4) or a web page to turn and play it (.html).",
         epilog="example: python -m jaxhair simulate perm --rod-diameter 60mm --output perm.gif",
     )
     _add_scene(run)
@@ -205,16 +205,15 @@ def _split_cpu(devices: int) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    ending = check_ending(options.output)
+    drawing: dict[str, Any] = {}
+    if check_ending(options.output) in PICTURES:
+        drawing["size"] = (options.size, options.size)
     check_color(options.output, options.color_by)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
     check.whole("--devices", options.devices, least=1)
     if options.devices > 1:
         _split_cpu(options.devices)
-    drawing: dict[str, Any] = {}
-    if ending in PICTURES:
-        drawing["size"] = (options.size, options.size)
     failed = False
     try:
         recording = simulate(

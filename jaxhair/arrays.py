@@ -143,8 +143,12 @@ def zip_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 
 
-def contents(path: Path) -> bytes:
+def check_regular(path: Path) -> None:
     # anything but a regular file could be endless
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} cannot be read: it must be a regular file")
+
+
+def contents(path: Path) -> bytes:
+    check_regular(path)
     return path.read_bytes()

@@ -1,4 +1,4 @@
-"""A recording as a file: arrays, strands, a picture or a movie, by the file's ending."""
+"""A recording as a file: arrays, USD, strands, a picture or a movie, by the file's ending."""
 
 import os
 from collections.abc import Iterable
@@ -21,8 +21,9 @@ COLORS = (*BONDS, "strain", "curvature")
 """What the colour of the hair can show: the bonded fraction of a kind of bond, an edge's length
 over its rest length less 1, or curvature [1/m]."""
 
-ENDINGS = (".npz", ".hair", ".data", ".png", ".gif", ".mp4", ".html")
+USD = (".usdc", ".usda", ".usd")
 PICTURES = (".png", ".gif", ".mp4")
+ENDINGS = (".npz", *USD, ".hair", ".data", *PICTURES, ".html")
 
 
 def save(
@@ -33,7 +34,7 @@ def save(
     color_by: str | None = None,
     overwrite: bool = False,
     progress: bool = False,
-    **drawing: Any,
+    **options: Any,
 ) -> None:
     """Writes a recording; the file's ending chooses how.
 
@@ -43,6 +44,8 @@ def save(
     |                | strands, points - 2, 4); `times` [s]; `phases`, of each frame; `counts`, |
     |                | points of each strand; `bonds`, the kinds; `scene`, as text; and every   |
     |                | number of the scene as `parameter:<name>`                                |
+    | `.usdc .usda   | animated BasisCurves with widths, colours and bonded fractions, and the  |
+    | .usd`          | obstacles, see `jaxhair.usd`; needs the extra `usd`                      |
     | `.hair .data`  | the strands of one frame                                                 |
     | `.png`         | a picture of one frame                                                   |
     | `.gif .mp4`    | a movie; needs the extra `pictures`, as `.png` does                      |
@@ -50,10 +53,11 @@ def save(
 
     Arguments:
         frame: for what holds one frame, and the one that a web page shows first; the last.
-        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures; a web
-            page can show "strain" and "curvature" too.
+        color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures and
+            USD; a web page can show "strain" and "curvature" too.
         overwrite: replace a file that exists. progress: show a bar for movies.
-        drawing: options of `jaxhair.pictures.Options`; for a web page those of `view`.
+        options: of `jaxhair.usd.write` for USD: basis, width, color, unit, up; of `view` for a web
+            page; of `jaxhair.pictures.Options` for pictures and movies.
 
     Raises ValueError for another ending, kind or frame, and FileExistsError.
     """
@@ -73,11 +77,15 @@ def save(
     elif ending == ".html":
         from jaxhair.viewer import view
 
-        page = view(recording, color_by=color_by, frame=frame, **drawing).page
+        page = view(recording, color_by=color_by, frame=frame, **options).page
         with new_file(path, overwrite=overwrite) as temporary:
             temporary.write_text(page, encoding="utf-8")
+    elif ending in USD:
+        from jaxhair import usd
+
+        usd.write(path, recording, color_by=color_by, overwrite=overwrite, **options)
     else:
-        _draw(path, recording, frame, color_by, overwrite, progress, drawing)
+        _draw(path, recording, frame, color_by, overwrite, progress, options)
 
 
 def check_ending(path: str | os.PathLike[str]) -> str:
@@ -126,9 +134,11 @@ def check_drawing(path: str | os.PathLike[str], size: int) -> None:
     """Raises what drawing a square picture or movie would raise, before any work is done.
 
     ValueError for a size [pixels] that is too small, or odd for an .mp4; ImportError without the
-    extra `pictures`.
+    extra `pictures`, or for a USD file `usd`.
     """
     ending = check_ending(path)
+    if ending in USD:
+        optional("pxr.Usd", "usd")
     if ending not in PICTURES:
         return
     check.whole("size", size, least=16)

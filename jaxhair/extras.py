@@ -3,7 +3,7 @@
 import importlib
 from typing import Any
 
-WHO = {"pictures": "pictures need", "posterior": "the posterior needs"}
+WHO = {"pictures": "pictures need", "posterior": "the posterior needs", "usd": "USD files need"}
 """By the extra's name."""
 
 

@@ -1,4 +1,7 @@
-"""The bytes of strand files, .hair, .data and .npz; what they hold stands in `jaxhair.files`."""
+"""The bytes of strand files, .hair, .data and .npz; what they hold stands in `jaxhair.files`.
+
+USD files are written by usd.py and read by usd_reading.py.
+"""
 
 import struct
 from collections.abc import Callable
@@ -13,13 +16,13 @@ from jaxhair.arrays import numbers, unzip, zip_arrays
 
 Points = NDArray[Any]
 Counts = NDArray[np.int64]
-Reader = Callable[[bytes], tuple[Points, Counts]]  # points one after the other, shape (all, 3)
+Reader = Callable[[bytes, int], tuple[Points, Counts]]  # frame; all points, shape (all, 3)
 Writer = Callable[[Path, Points, Counts, float, str], None]  # padded points; counts, unit, up
 
 _HAIR_HEADER = struct.Struct("<4sIIIIff3f88s")
 _HAIR_BYTES = {"points": 12, "thickness": 4, "transparency": 4, "colours": 12}  # for each point
 _MOST_SEGMENTS = 65535
-_HAIR_DIAMETER = 80e-6  # [m]; a file must state one, and readers draw it
+HAIR_DIAMETER = 80e-6  # [m]; a file must state one, and readers draw it
 
 
 def check_counts(counts: NDArray[Any], strands: int, *, least: int, most: int) -> None:
@@ -45,7 +48,16 @@ def _expect_size(what: str, size: int, data: bytes) -> None:
         raise ValueError(f"the file has {len(data)} bytes; with {what} it must have {size}")
 
 
-def _read_hair(data: bytes) -> tuple[Points, Counts]:
+def _check_frame(frame: int, frames: int) -> None:
+    if not -frames <= frame < frames:
+        raise ValueError(
+            f"frame is {frame}; of the {frames} frames that the file has, it must be from "
+            f"{-frames} to {frames - 1}"
+        )
+
+
+def _read_hair(data: bytes, frame: int) -> tuple[Points, Counts]:
+    _check_frame(frame, 1)
     if len(data) < _HAIR_HEADER.size or data[:4] != b"HAIR":
         raise ValueError(
             f"the file has {len(data)} bytes and starts with {data[:4]!r}; a .hair file must have "
@@ -85,14 +97,15 @@ def _write_hair(path: Path, points: Points, counts: Counts, unit: float, up: str
         )
     header = _HAIR_HEADER.pack(
         *(b"HAIR", len(counts), counts.sum(), 0b11, 0),
-        *(_HAIR_DIAMETER / unit, 0.0, 1.0, 1.0, 1.0),
+        *(HAIR_DIAMETER / unit, 0.0, 1.0, 1.0, 1.0),
         f"jaxhair: 1 unit = {unit:g} m, {up} up".encode("ascii"),
     )
     flat = _within(points, counts)
     path.write_bytes(header + (counts - 1).astype("<u2").tobytes() + flat.tobytes())
 
 
-def _read_data(data: bytes) -> tuple[Points, Counts]:
+def _read_data(data: bytes, frame: int) -> tuple[Points, Counts]:
+    _check_frame(frame, 1)
     if len(data) < 4:
         raise ValueError(f"the file has {len(data)} bytes; a .data file must have at least 4")
     (strands,) = struct.unpack_from("<i", data)
@@ -130,7 +143,7 @@ def _write_data(path: Path, points: Points, counts: Counts, unit: float, up: str
             file.write(struct.pack("<i", count) + strand[:count].tobytes())
 
 
-def _read_npz(data: bytes) -> tuple[Points, Counts]:
+def _read_npz(data: bytes, frame: int) -> tuple[Points, Counts]:
     arrays = unzip(data, ("positions", "counts"))
     if "positions" not in arrays:
         raise ValueError("the file has no array 'positions'; strands must be in one of that name")
@@ -142,7 +155,8 @@ def _read_npz(data: bytes) -> tuple[Points, Counts]:
             f"positions has shape {shape}; it must have shape (strands, points, 3) or "
             "(frames, strands, points, 3), with at least one point and frame"
         )
-    points = points[-1] if len(shape) == 4 else points
+    _check_frame(frame, shape[0] if len(shape) == 4 else 1)
+    points = points[frame] if len(shape) == 4 else points
     strands, most, _ = points.shape
     counts = numbers("counts", arrays.get("counts", np.full(strands, most)), "iu")
     check_counts(counts, strands, least=0, most=most)
@@ -154,15 +168,23 @@ def _write_npz(path: Path, points: Points, counts: Counts, unit: float, up: str)
     zip_arrays(path, {"positions": points, "counts": counts.astype("<i4")})
 
 
-_FORMATS: dict[str, tuple[Reader, Writer]] = {
+def _write_usd(path: Path, points: Points, counts: Counts, unit: float, up: str) -> None:
+    from jaxhair.usd import write_still
+
+    write_still(path, points, counts, unit=unit, up=up)
+
+
+_FORMATS: dict[str, tuple[Reader | None, Writer]] = {
     ".hair": (_read_hair, _write_hair),
     ".data": (_read_data, _write_data),
     ".npz": (_read_npz, _write_npz),
+    **dict.fromkeys((".usd", ".usda", ".usdc"), (None, _write_usd)),
 }
 
 
-def format_of(path: Path) -> tuple[Reader, Writer]:
-    """Reader and writer of the format that the ending of `path` stands for."""
+def format_of(path: Path) -> tuple[Reader | None, Writer]:
+    """Reader and writer of the format that the ending of `path` stands for; USD files, which may
+    refer to other files, are not read from bytes."""
     ending = path.suffix.lower()
     if ending not in _FORMATS:
         wanted = f"it must end in one of {', '.join(_FORMATS)}"

@@ -1,27 +1,31 @@
-"""Strand files: .hair, .data and .npz; and named arrays in .npz.
+"""Strand files: .hair, .data, .npz and USD.
 
 | ending  | content                                                                             |
 | ------- | ----------------------------------------------------------------------------------- |
 | `.hair` | Cem Yuksel's HAIR format; thickness, transparency and colours are not read          |
 | `.data` | int32 strands; for each, int32 points and that many x y z as float32                |
 | `.npz`  | `positions`, shape (strands, points, 3) or (frames, strands, points, 3), of which   |
-|         | the last frame is read; optionally `counts`, the points of each strand              |
+|         | one frame is read; optionally `counts`, the points of each strand                   |
+| `.usd`, | BasisCurves at one time, see `jaxhair.usd_reading`; needs the extra `usd`           |
+| `.usda`,|                                                                                     |
+| `.usdc` |                                                                                     |
 
-All are little-endian and written in float32. None of them says what its unit of length is or
-which of its axes points up, so a reader must know: `unit` and `up` of the functions below.
+All are written in float32, and the first three little-endian. Of these none says what its unit of
+length is or which of its axes points up, so a reader must know: `unit` and `up` of the functions
+below. USD files say it; where one does not, by USD's rules it is in centimetres and Y up.
 """
 
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxhair import check
-from jaxhair.arrays import contents, numbers
+from jaxhair import check, usd_reading
+from jaxhair.arrays import check_regular, contents, numbers
 from jaxhair.file_formats import Counts, Points, check_counts, format_of
 from jaxhair.output import new_file
 
@@ -102,27 +106,34 @@ class Curves:
 def read_curves(
     path: str | os.PathLike[str],
     *,
-    unit: float = 1.0,
-    up: Literal["y", "z"] = "z",
+    unit: float | None = None,
+    up: Literal["y", "z"] | None = None,
     skip_short: bool = False,
+    frame: int = -1,
+    time: float | None = None,
 ) -> Curves:
-    """Strands of a .hair, .data or .npz file, in metres and Z up, in the order of the file.
+    """Strands of a .hair, .data, .npz or USD file, in metres and Z up, in the order of the file.
 
-    unit: length of the file's unit [m]: 0.01 for centimetres, 0.0254 for inches.
-    up: the axis of the file that points up. From "y", (x, y, z) becomes (x, -z, y), a rotation.
+    unit: length of the file's unit [m]: 0.01 for centimetres, 0.0254 for inches. By default what a
+    USD file says, 1 for the others.
+    up: the axis of the file that points up, by default what a USD file says, "z" for the others.
+    From "y", (x, y, z) becomes (x, -z, y), a rotation.
     skip_short: leave out strands of no or one point, which files may hold (roots of bald places)
     but which have no direction to simulate. Without it they are refused.
+    frame: of an animated .npz or USD file, by default the last; below 0 it counts from the end.
+    time: of a USD file [s], in place of a frame; between frames it interpolates.
 
     A file may hold no strands; then `points` has shape (0, 0, 3).
 
     Raises ValueError naming the file, what is wrong and what is allowed, where the file is
     truncated, of another format or inconsistent, or has coordinates that are not finite or strands
-    as uneven as `Curves.from_list` refuses. No more memory is taken than the file's size warrants.
-    FileNotFoundError and other OSError where it cannot be opened.
+    as uneven as `Curves.from_list` refuses, or has no such frame. No more memory is taken than the
+    file's size warrants. FileNotFoundError and other OSError where it cannot be opened,
+    ImportError for a USD file without the extra `usd`.
     """
     path = check.path("path", path)
     check.flag("skip_short", skip_short)
-    points, counts = _read(path, unit, up)
+    points, counts = _read(path, unit, up, frame, time)
     try:
         short = counts < 2
         if np.any(short):
@@ -133,7 +144,6 @@ def read_curves(
                     "must have at least 2 points; skip_short=True leaves the others out"
                 )
             points, counts = points[np.repeat(~short, counts)], counts[~short]
-        # before any arithmetic, in which a signalling NaN would raise a warning
         if not np.all(finite := np.isfinite(points)):
             row = int(np.argmin(finite.all(axis=1)))
             ends = np.cumsum(counts)
@@ -142,13 +152,18 @@ def read_curves(
                 f"point {row - int(ends[strand] - counts[strand])} of strand {strand} is "
                 f"{points[row].tolist()}; coordinates must be finite"
             )
-        return Curves(_padded(_metres(points, unit, up), counts), counts)
+        return Curves(_padded(points, counts), counts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
 def read_strands(
-    path: str | os.PathLike[str], *, unit: float = 1.0, up: Literal["y", "z"] = "z"
+    path: str | os.PathLike[str],
+    *,
+    unit: float | None = None,
+    up: Literal["y", "z"] | None = None,
+    frame: int = -1,
+    time: float | None = None,
 ) -> list[NDArray[np.float64]]:
     """Every strand of a file as it is: points [m], Z up, each of shape (its points, 3).
 
@@ -157,29 +172,51 @@ def read_strands(
     another format or inconsistent is refused.
     """
     path = check.path("path", path)
-    points, counts = _read(path, unit, up)
-    points, ends = _metres(points, unit, up), np.cumsum(counts)
-    return [points[end - count : end] for count, end in zip(counts, ends, strict=True)]
+    points, counts = _read(path, unit, up, frame, time)
+    return [points[e - count : e] for count, e in zip(counts, np.cumsum(counts), strict=True)]
 
 
-def _read(path: Path, unit: float, up: str) -> tuple[Points, Counts]:
-    """Points in the file's unit and axes, shape (all points, 3), and counts of the strands."""
+def _read(
+    path: Path, unit: float | None, up: str | None, frame: int, time: float | None
+) -> tuple[NDArray[np.float64], Counts]:
+    """Points [m], Z up, shape (all points, 3), and counts of the strands."""
     reader, _ = format_of(path)
-    _check_unit(unit, up)
-    data = contents(path)
+    check_unit(1.0 if unit is None else unit, "z" if up is None else up)
+    check.whole("frame", frame, least=-1_000_000)
+    if time is not None:
+        check.number("time", time)
+        if reader is not None or frame != -1:
+            raise ValueError(
+                f"time is {check.short(time)}; it must be left out unless the file is a USD file "
+                "and no frame is given"
+            )
+    data = b"" if reader is None else contents(path)
+    check_regular(path)
     try:
-        return reader(data)
+        if reader is None:
+            points, counts, own_unit, own_up = usd_reading.read(path, frame=frame, time=time)
+        else:
+            points, counts = reader(data, int(frame))
+            own_unit, own_up = 1.0, "z"
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    return _metres(points, own_unit if unit is None else unit, up or own_up), counts
 
 
-def _metres(points: Points, unit: float, up: str) -> Points:
+def _metres(points: Points, unit: float, up: str) -> NDArray[np.float64]:
     """Points of a file in metres and Z up."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is for others to judge
         points = points.astype(np.float64) * unit
         if up == "y":
             points = points[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
     return points
+
+
+def to_unit(points: Points, unit: float, up: str) -> NDArray[Any]:
+    """Points [m], Z up, in a file's unit and axes."""
+    with np.errstate(over="ignore"):  # for others to judge
+        points = points / unit
+    return points[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0]) if up == "y" else points
 
 
 def write_curves(
@@ -190,24 +227,22 @@ def write_curves(
     up: Literal["y", "z"] = "z",
     overwrite: bool = False,
 ) -> None:
-    """Write strands to a .hair, .data or .npz file in the given unit and axes, as float32.
+    """Write strands to a .hair, .data, .npz or USD file in the given unit and axes, as float32.
 
     unit: length of the file's unit [m]: 0.01 for centimetres, 0.0254 for inches.
     up: the axis of the file that points up. With "y", (x, y, z) becomes (x, z, -y), a rotation.
 
     The file appears when it is complete; see `jaxhair.output.new_file` for what is raised where
     it exists or its folder does not. Raises ValueError where the ending is another, a coordinate
-    is too large for float32, or a strand has more than 65,536 points and the file is a .hair.
+    is too large for float32, or a strand has more than 65,536 points and the file is a .hair, or
+    fewer than 2 and it is a USD file.
     """
     path = check.path("path", path)
     _, writer = format_of(path)
-    _check_unit(unit, up)
+    check_unit(unit, up)
     check.instance("curves", curves, Curves)
     check.flag("overwrite", overwrite)
-    with np.errstate(over="ignore"):  # reported below
-        points = curves.points / unit
-    if up == "y":
-        points = points[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    points = to_unit(curves.points, unit, up)
     if np.any(large := np.abs(points) > np.finfo(np.float32).max):
         place = tuple(int(i) for i in np.argwhere(large)[0])
         raise ValueError(
@@ -218,7 +253,7 @@ def write_curves(
         writer(temporary, points.astype("<f4"), curves.counts, unit, up)
 
 
-def _check_unit(unit: float, up: str) -> None:
+def check_unit(unit: float, up: str) -> None:
     # the bounds catch mistakes, and keep a product of float32 and unit far from float64's limits
     if isinstance(unit, bool | np.timedelta64) or not isinstance(
         unit, int | float | np.integer | np.floating

@@ -354,7 +354,7 @@ def test_other_endings(tmp_path, name):
             call()
 
 
-@pytest.mark.parametrize("unit", [0, -1, np.nan, np.inf, 1e13, 1e-13, True, "cm", None, 1j])
+@pytest.mark.parametrize("unit", [0, -1, np.nan, np.inf, 1e13, 1e-13, True, "cm", (), 1j])
 def test_unit_is_checked(tmp_path, unit):
     with pytest.raises(ValueError, match=r"unit is .*; it must be"):
         read_curves(tmp_path / "a.hair", unit=unit)
@@ -362,7 +362,7 @@ def test_unit_is_checked(tmp_path, unit):
         write_curves(tmp_path / "a.hair", Curves.from_list([A]), unit=unit)
 
 
-@pytest.mark.parametrize("up", ["x", "Z", None, 1])
+@pytest.mark.parametrize("up", ["x", "Z", "", 1])
 def test_up_is_checked(tmp_path, up):
     with pytest.raises(ValueError, match=r"up is .*one of 'y', 'z'"):
         read_curves(tmp_path / "a.hair", up=up)

@@ -25,21 +25,27 @@ SHAPE = 1 + 1e-4  # of remembered shapes' norms
 assert {contact, forces, geometry, materials}  # imported for the cases that they list
 
 
-def settings(now: tuple[str, ...], later: tuple[str, ...]) -> list[object]:
-    """All cases for each "solver-precision", each of these in a process; later ones only in the
-    slow run."""
+def settings(now: tuple[str, ...], later: tuple[str, ...], in_turn: bool = False) -> list[object]:
+    """All cases for each "solver-precision", each of these in a process.
+
+    Arguments:
+        later: only in the slow run. in_turn: outside of it each case has one of `now`, and the
+            next case the next one.
+    """
+
+    def marks(setting: str, place: int) -> list[pytest.MarkDecorator]:
+        slow = setting in later or (in_turn and setting != now[place % len(now)])
+        return [pytest.mark.xdist_group(setting), *([pytest.mark.slow] if slow else [])]
+
     return [
         pytest.param(
             name,
             Setting(*setting.split("-")),
             id=f"{setting}-{name}",
-            marks=[
-                pytest.mark.xdist_group(setting),
-                *([pytest.mark.slow] if setting in later else []),
-            ],
+            marks=marks(setting, place),
         )
         for setting in (*now, *later)
-        for name in CASES
+        for place, name in enumerate(CASES)
     ]
 
 
@@ -72,6 +78,7 @@ def test_values(name: str, setting: Setting) -> None:
     settings(
         ("direct-float64", "paper-float64"),
         ("compliant-float64", "direct-float32", "paper-float32", "compliant-float32"),
+        in_turn=True,
     ),
 )
 def test_derivatives(name: str, setting: Setting) -> None:
