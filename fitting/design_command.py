@@ -73,7 +73,7 @@ def parser() -> Parser:
         metavar="FILE",
         help="fit.json of an earlier fit, whose influences f_j to use (default: the paper's)",
     )
-    add("--check", action=Switch, default=True, help="whether to simulate the design finer")
+    add("--check", action=Switch, default=True, help="leave out the finer simulation")
     add_output(top, FILES, required=False)
     add_json(top)
     add_quiet(top)

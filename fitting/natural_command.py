@@ -62,7 +62,12 @@ def parser() -> Parser:
     add_strand_files(top)
     add("--strands", type=whole(1), help="how many to use at most, spread evenly (default: all)")
     add("--points", type=whole(4), help="points on a simulated strand (default: 17 to 65)")
-    add("--weight", action=Switch, default=True, help="whether FILE shows strands under weight")
+    add(
+        "--weight",
+        action=Switch,
+        default=True,
+        help="FILE shows strands without weight, as modelled",
+    )
     add_output(top, (REPORT, PICTURE, *STRANDS.values()))
     add_json(top)
     add_checkpoint(top)

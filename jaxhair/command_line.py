@@ -26,11 +26,25 @@ CODES = (
     "what was asked, or a file that cannot be read or written; 130 interrupted by Ctrl-C"
 )
 
+SWITCHES = (
+    "A switch of the settings file is undone by the same name with --no- before it, or without: "
+    "--no-quiet undoes quiet = true."
+)
+
 UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 class Mistake(ValueError):
     """What was asked for on a command line cannot be."""
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Shows of a switch the name that changes something, not the one that undoes it."""
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        if isinstance(action, Switch):
+            return action.option_strings[0]
+        return super()._format_action_invocation(action)
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,19 +63,19 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         shown = [_example(example) for example in examples]
         lines = ["examples:", *shown] if len(shown) > 1 else ["example:", *shown]
-        paragraphs = [_filled(text) for text in (*notes, CODES)]
+        paragraphs = [_filled(text) for text in (*notes, SWITCHES, CODES)]
         super().__init__(
             prog=prog,
             description=_filled(description),
             epilog="\n\n".join(["\n".join(lines), *paragraphs]),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=_Help,
             allow_abbrev=False,
         )
         self.add_argument(
             "--settings",
             metavar="FILE",
             help="read options from this TOML file, by their names without the dashes: strands = "
-            "20, wash = true. Options given here win over it",
+            "20, quiet = true. Options given here win over it",
         )
 
     def error(self, message: str) -> NoReturn:
@@ -102,6 +116,8 @@ class Parser(argparse.ArgumentParser):
                 settings = tomllib.load(file)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise Mistake(f"--settings is {path}; it must be a TOML file: {error}") from None
+        except OSError as error:
+            raise Mistake(f"--settings is {path}, which is not read: {error.strerror}") from None
         actions = {
             (flag.removeprefix("--") or action.dest): action
             for action in self._actions
@@ -210,7 +226,8 @@ def _filled(text: str) -> str:
 
 def nearest(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
     """The end of a message on an unknown name: the nearest known ones, or all."""
-    found = get_close_matches(name, list(names), n=3, cutoff=0.5)
+    found = get_close_matches(name, list(names), n=2, cutoff=0.6)
+    found = [n for n in found if not ("no-" in n and n.replace("no-", "", 1) in found)]
     if found:
         return f"; the nearest {'is' if len(found) == 1 else 'are'} {', '.join(found)}"
     return f"; it must be one of {check.listed(names)}"
@@ -265,7 +282,7 @@ def one_of(*names: str) -> dict[str, Any]:
 
     def parse(text: str) -> str:
         if text not in names:
-            near = get_close_matches(text, names, n=1)
+            near = get_close_matches(text, names, n=1, cutoff=0.5)
             hint = f"; the nearest is {near[0]}" if near else ""
             raise argparse.ArgumentTypeError(
                 f"is {check.short(text)}; it must be one of {check.listed(names)}{hint}"

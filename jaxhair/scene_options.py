@@ -48,7 +48,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
     add("--length", type=length, help="of a strand, such as 24cm (default: as in the paper)")
     add("--rod-diameter", type=length, help="of the perm's rod, such as 60mm (default: 60 mm)")
     add("--prepared", action=Switch, help="start the perm wound, skip the winding")
-    add("--contact", action=Switch, default=True, help="whether hair collides with hair")
+    add("--contact", action=Switch, default=True, help="let hairs pass through each other")
     add("--wash", action=Switch, help="wash the hair at the end")
     add("--seconds", type=positive, help="stop after this simulated time (default: all phases)")
     add("--seed", type=whole(0), default=0, help="of the roots' places (default: %(default)d)")
@@ -182,6 +182,6 @@ def listed(scene: Scene) -> str:
         values = np.asarray(leaf, scene.dtype)
         shown = ",".join(map(str, values.ravel()))
         if values.size > MANY:
-            shown = f"({values.size} numbers from {values.min()} to {values.max()})"
+            shown = f"({values.size} numbers from {values.min()!s} to {values.max()!s})"
         lines.append(f"{name}={shown}")
     return "\n".join(lines)
