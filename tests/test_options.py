@@ -222,7 +222,7 @@ def test_numbers_are_listed_and_set_by_name(capsys: pytest.CaptureFixture[str]) 
     ("text", "words"),
     [
         ("fibre.stiffness", "NAME=VALUE"),
-        ("fibre.peling_rate=1", "nearest are fibre.peeling_rate"),
+        ("fibre.peling_rate=1", "nearest is fibre.peeling_rate"),
         ("*.nothing=1", "'*.nothing', which the scene does not have"),
         ("fibre.stiffness=soft", "--set fibre.stiffness is 'soft'; it must be a number"),
         ("fibre.stiffness=1,2", "--set fibre.stiffness is '1,2'; it must be a number"),
@@ -249,7 +249,8 @@ def test_the_work_of_a_settings_file_goes_on_from_options(
     """A checkpoint of the one is the other's."""
     monkeypatch.chdir(tmp_path)
     Path("s.toml").write_text(
-        "prepared = true\ncontact = false\nstrands = 1\npoints = 9\nlength = 0.24\nseconds = 0.02\nfps = 100\n"
+        "prepared = true\ncontact = false\nstrands = 1\npoints = 9\nlength = 0.24\n"
+        "seconds = 0.02\nfps = 100\n"
         'quiet = true\ncheckpoint = "kept"\nset = {fibre.peeling_rate = 0.5}'
     )
     assert main(["simulate", "perm", "--settings", "s.toml", "--output", "a.npz"]) == 0
