@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxhair.command_line import UNITS, one_of
+from jaxhair.options import UNITS, one_of
 
 STRAND_UNITS = {**UNITS, "inch": 0.0254}
 """Units that strand files may be in [m]."""

@@ -15,23 +15,9 @@ import numpy as np
 from fitting.design import Design, Unreachable, Wish, as_text, design
 from fitting.targets import Helix, aligned_residuals
 from jaxhair import BONDS, Curves, write_curves
-from jaxhair.command_line import (
-    FAILED,
-    OK,
-    Mistake,
-    Parser,
-    Switch,
-    add_json,
-    add_output,
-    add_quiet,
-    fraction,
-    length,
-    positive,
-    status,
-    told,
-    wrote,
-)
+from jaxhair.command_line import FAILED, OK, Mistake, Parser, status, told, wrote
 from jaxhair.export import check_new, check_new_folder
+from jaxhair.options import Switch, add_json, add_output, add_quiet, fraction, length, positive
 from jaxhair.output import new_file
 from jaxhair.progress import Progress
 

@@ -16,12 +16,8 @@ from fitting.optimisers import METHODS
 from fitting.report import check_outputs, table, write
 from fitting.strands import STATES, from_strands
 from jaxhair import read_curves
-from jaxhair.command_line import (
-    FAILED,
-    OK,
-    Command,
-    Mistake,
-    Parser,
+from jaxhair.command_line import FAILED, OK, Command, Mistake, Parser, status, wrote
+from jaxhair.options import (
     Switch,
     add_checkpoint,
     add_json,
@@ -29,9 +25,7 @@ from jaxhair.command_line import (
     add_quiet,
     length,
     one_of,
-    status,
     whole,
-    wrote,
 )
 from jaxhair.progress import Progress
 
@@ -141,7 +135,7 @@ def _fit(options: argparse.Namespace) -> int:
         print(said, file=sys.stderr, flush=True)
     # other starts, and the line searches of L-BFGS, take simulations beyond the steps
     most = None if options.method == "l-bfgs" else options.steps
-    with Progress("at most", most, unit="simulation", shown=not options.quiet) as bar:
+    with Progress("fitting, at most", most, unit="simulation", shown=not options.quiet) as bar:
 
         def progress(simulations: int, misfit: float, values: dict[str, np.ndarray]) -> None:
             total = None if most is None else max(most, simulations)

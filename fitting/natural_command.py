@@ -15,20 +15,9 @@ from fitting.measures import curl
 from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
 from fitting.report import plain, versions
 from jaxhair import BONDS, Curves, read_strands, write_curves
-from jaxhair.command_line import (
-    OK,
-    Mistake,
-    Parser,
-    Switch,
-    add_checkpoint,
-    add_json,
-    add_output,
-    add_quiet,
-    status,
-    whole,
-    wrote,
-)
+from jaxhair.command_line import OK, Mistake, Parser, status, wrote
 from jaxhair.export import check_new
+from jaxhair.options import Switch, add_checkpoint, add_json, add_output, add_quiet, whole
 from jaxhair.output import new_file
 from jaxhair.progress import Progress
 

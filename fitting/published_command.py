@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fitting.published import FILES, lotions, predictions, table, write
-from jaxhair.command_line import OK, Parser, add_json, add_output, add_quiet, status, wrote
+from jaxhair.command_line import OK, Parser, status, wrote
 from jaxhair.export import check_new_folder
+from jaxhair.options import add_json, add_output, add_quiet
 
 
 def parser() -> Parser:

@@ -7,17 +7,9 @@ from typing import Any
 import numpy as np
 
 from jaxhair import check, scenes
-from jaxhair.command_line import (
-    Assignments,
-    Mistake,
-    Switch,
-    length,
-    nearest,
-    one_of,
-    positive,
-    whole,
-)
+from jaxhair.command_line import Mistake
 from jaxhair.direct import Direct
+from jaxhair.options import Assignments, Switch, length, nearest, one_of, positive, whole
 from jaxhair.scene import Scene, matching, named_leaves, replace_leaves
 from jaxhair.solvers import SWEEPS, Compliant, PositionBased, Solver
 from jaxhair.treatments import wash

@@ -8,22 +8,9 @@ from contextlib import suppress
 
 import jax
 
-from jaxhair.command_line import (
-    FAILED,
-    INTERRUPTED,
-    OK,
-    Mistake,
-    Parser,
-    Switch,
-    add_checkpoint,
-    add_quiet,
-    one_of,
-    positive,
-    status,
-    told,
-    whole,
-)
+from jaxhair.command_line import FAILED, INTERRUPTED, OK, Mistake, Parser, status, told
 from jaxhair.export import ENDINGS, check_drawing, check_ending, check_new, save
+from jaxhair.options import Switch, add_checkpoint, add_quiet, one_of, positive, whole
 from jaxhair.recording import NotFinite, simulate
 from jaxhair.scene_options import NOTE, add_scene, listed, scene_of
 from jaxhair.strands import BONDS

@@ -11,7 +11,7 @@ import pytest
 import jaxhair as jh
 from fitting.__main__ import main as fit_main
 from jaxhair.__main__ import main as simulate_main
-from jaxhair.command_line import length
+from jaxhair.options import length
 
 PERM = (
     "simulate perm --prepared --no-contact --strands 2 --points 9 --length 24cm "

@@ -17,7 +17,8 @@ import jaxhair as jh
 from fitting.__main__ import main as fit_main
 from fitting.design import Unreachable
 from jaxhair.__main__ import main
-from jaxhair.command_line import Parser, Switch, status
+from jaxhair.command_line import Parser, status
+from jaxhair.options import Switch
 from jaxhair.progress import Progress, each
 from jaxhair.recording import NotFinite
 from jaxhair.scene_options import listed, replaced, scene_of

@@ -17,20 +17,10 @@ from jaxhair.accuracy.grid import Plan
 from jaxhair.accuracy.measuring import Row, measure
 from jaxhair.accuracy.problem import PARAMETERS, Reference, reference
 from jaxhair.accuracy.stretch import Stretch, stretch
-from jaxhair.command_line import (
-    INTERRUPTED,
-    OK,
-    Parser,
-    Switch,
-    add_json,
-    add_output,
-    add_quiet,
-    status,
-    whole,
-    wrote,
-)
+from jaxhair.command_line import INTERRUPTED, OK, Parser, status, wrote
 from jaxhair.export import check_new_folder
 from jaxhair.extras import optional
+from jaxhair.options import Switch, add_json, add_output, add_quiet, whole
 from jaxhair.output import new_file
 from jaxhair.progress import each
 

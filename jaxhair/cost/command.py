@@ -6,21 +6,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxhair.command_line import (
-    OK,
-    Parser,
-    Switch,
-    add_json,
-    add_output,
-    add_quiet,
-    status,
-    whole,
-    wrote,
-)
+from jaxhair.command_line import OK, Parser, status, wrote
 from jaxhair.cost import table
 from jaxhair.cost.measuring import SceneCost, measured
 from jaxhair.export import check_new_folder
 from jaxhair.extras import optional
+from jaxhair.options import Switch, add_json, add_output, add_quiet, whole
 from jaxhair.output import new_file
 from jaxhair.scene_options import NOTE, add_scene, listed, scene_of
 
