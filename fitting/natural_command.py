@@ -82,9 +82,6 @@ def _natural(options: argparse.Namespace) -> int:
         check_new(folder / name, overwrite=options.overwrite)
     kept = None if options.checkpoint is None else Path(options.checkpoint)
     shown = not options.quiet
-    if shown:
-        said = f"Fitting {len(seen[0])} strands. The first simulations include compilation."
-        print(said, file=sys.stderr, flush=True)
     with Progress("shapes to remember, at most", None, unit="strand", shown=shown) as bar:
         hair = natural(
             seen[0],

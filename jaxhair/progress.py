@@ -58,7 +58,7 @@ class Progress:
         """Nothing more is done."""
         if self._bar is not None:
             self._bar.close()
-        elif self._shown:
+        elif self._shown and self.done:
             self._tell(time.monotonic())
         self._shown, self._bar = False, None
 

@@ -185,6 +185,7 @@ def test_mistakes(
     assert main(["natural", *arguments, *output]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
+    assert error.count("\n") == 1
     for word in words:
         assert word in error
     assert {p: p.read_bytes() for p in Path().rglob("*") if p.is_file()} == before
