@@ -10,7 +10,7 @@ nearest curl that can be had.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +22,6 @@ from fitting import measures
 from fitting.constraints import Constraint, Interval
 from fitting.curls import Curl
 from fitting.fit import Fit, fit
-from fitting.parameters import matching
 from jaxhair import (
     Bonds,
     Direct,
@@ -39,6 +38,7 @@ from jaxhair import (
     run,
     treatments,
 )
+from jaxhair.scene import matching
 
 RODS = (3e-3, 0.1)
 """Diameters of the thinnest and the thickest perm rod [m]."""
@@ -190,11 +190,17 @@ class Design:
         return float(np.sqrt(sum(value**2 for value in self.sensitivities.values())))
 
 
-def design(wish: Wish, *, verify: bool = True) -> Design:
+def design(
+    wish: Wish,
+    *,
+    verify: bool = True,
+    progress: Callable[[int, str], None] = lambda done, doing: None,
+) -> Design:
     """The rod, and where it must be another, the treatment that give a wanted curl.
 
     Arguments:
         verify: simulate the design afresh and finer, which takes longer than to find it.
+        progress: called with how many of 3 stages are done and what is done next.
 
     Raises Unreachable, with the nearest curl, where no rod of `RODS` and no treatment give it.
     """
@@ -206,9 +212,11 @@ def design(wish: Wish, *, verify: bool = True) -> Design:
     free: dict[str, Constraint] = {ROD: Interval(*RODS)}
     if wish.waves is not None:
         free[CLIMB] = Interval(-1.2, 1.2)
+    progress(0, "the rod")
     found = fit(scene, target, free, prior_width=30.0)
     if _off(found, wish) > 2 * EXACT:
         # another treatment; the fit starts from the nearest end of what rods can do
+        progress(1, "another treatment")
         left = float(np.clip(wish.disulfide_left, CUT[0] + 0.01, CUT[1] - 0.01))
         scene = _with(scene, {LEFT: left, ROD: _value(found, ROD)})
         found = fit(scene, target, {**free, LEFT: Interval(*CUT)}, prior_width=30.0)
@@ -218,7 +226,9 @@ def design(wish: Wish, *, verify: bool = True) -> Design:
     curl = _curl(found, wish)
     finer = math.nan
     if verify:
+        progress(2, "a finer simulation")
         finer = _simulated_finer(wish, found)
+    progress(3, "")
     waves = float(curl.waves[0])
     unmet = []
     if wish.waves is not None and abs(waves / wish.waves - 1) > 0.02:

@@ -12,74 +12,94 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.design import Design, Wish, as_text, design
+from fitting.design import Design, Unreachable, Wish, as_text, design
 from fitting.targets import Helix, aligned_residuals
 from jaxhair import BONDS, Curves, write_curves
-from jaxhair.__main__ import length, parsed
-from jaxhair.export import check_new
+from jaxhair.command_line import FAILED, OK, Mistake, Parser, status, told, wrote
+from jaxhair.export import check_new, check_new_folder
+from jaxhair.options import Switch, add_json, add_output, add_quiet, fraction, length, positive
 from jaxhair.output import new_file
+from jaxhair.progress import Progress
 
 FILES = ("design.json", "designed.hair", "design.png")
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line's parser."""
-    top = argparse.ArgumentParser(
-        prog="python -m fitting design",
-        description="Finds the perm rod, and where no rod will do another treatment, that give a "
-        "wanted curl; checks it in a finer simulation; says how the answer changes with what is "
-        "not well known of a hair. A curl that cannot be had is refused with the nearest that can.",
-        epilog="example: python -m fitting design --curl-diameter 25mm --length 20cm --after-wash "
-        "--output designed",
+STAGES = 3
+"""Of a design, at most: the rod, another treatment, the finer simulation."""
+
+
+def parser() -> Parser:
+    """The command's parser."""
+    top = Parser(
+        "python -m fitting design",
+        "Finds the perm rod, and where no rod will do another treatment, that give a wanted curl; "
+        "checks it in a finer simulation; says how the answer changes with what is not well known "
+        "of a hair. A curl that cannot be had is refused with the nearest that can (exit code 1).",
+        [
+            "python -m fitting design --curl-diameter 25mm --length 20cm --after-wash "
+            "--output designed",
+            "python -m fitting design --curl-diameter 30mm --waves 2 --hair fitted/fit.json --json",
+        ],
     )
-    top.add_argument("--curl-diameter", required=True, type=length, help="such as 25mm")
-    top.add_argument("--length", type=length, default=0.2, help="of the hair (20cm)")
-    top.add_argument("--waves", type=float, help="turns of the curl (any)")
-    top.add_argument("--after-wash", action="store_true", help="the curl is that after a wash")
-    top.add_argument("--weight", action="store_true", help="the hair hangs under its weight")
-    top.add_argument(
+    add = top.add_argument
+    add("--curl-diameter", required=True, type=length, help="such as 25mm")
+    add("--length", type=length, default=0.2, help="of the hair, such as 30cm (default: 20 cm)")
+    add("--waves", type=positive, help="turns of the curl (default: any number)")
+    add("--after-wash", action=Switch, help="the curl is that after a wash")
+    add("--weight", action=Switch, help="the hair hangs under its weight")
+    add(
         "--disulfide-left",
-        type=float,
+        type=fraction,
         default=0.8,
-        help="fraction of disulfide bonds that the perm leaves, where a rod goes with it (0.8)",
+        help="fraction of disulfide bonds that the perm leaves, where a rod goes with it "
+        "(default: %(default)g)",
     )
-    top.add_argument(
-        "--hair", metavar="FILE", help="fit.json of an earlier fit, whose influences f_j to use"
+    add(
+        "--hair",
+        metavar="FILE",
+        help="fit.json of an earlier fit, whose influences f_j to use (default: the paper's)",
     )
-    top.add_argument("--no-check", action="store_true", help="leave out the finer simulation")
-    top.add_argument("--output", metavar="DIR", help=f"folder for {', '.join(FILES)}")
-    top.add_argument("--overwrite", action="store_true", help="replace files in DIR")
+    add("--check", action=Switch, default=True, help="leave out the finer simulation")
+    add_output(top, FILES, required=False)
+    add_json(top)
+    add_quiet(top)
     return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Designs, prints and writes; returns 0, or 1 if the wish is not met, or 2 if it cannot be or
-    after a mistake in the request."""
-    options = parsed(parser(), arguments)
-    try:
-        folder = None if options.output is None else Path(options.output)
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            for name in FILES:
-                check_new(folder / name, overwrite=options.overwrite)
-        wish = Wish(
-            options.curl_diameter,
-            options.length,
-            options.waves,
-            options.after_wash,
-            options.weight,
-            options.disulfide_left,
-            **({} if options.hair is None else {"influence": _influence(options.hair)}),
-        )
-        found = design(wish, verify=not options.no_check)
-        print(as_text(found))
-        if folder is not None:
-            written = write(found, folder, overwrite=options.overwrite)
-            print("wrote " + ", ".join(str(path) for path in written))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0 if found.met else 1
+    """Runs the command; returns its exit code: 1 if the wish is not met."""
+    return status(parser(), _design, arguments)
+
+
+def _design(options: argparse.Namespace) -> int:
+    influence = {} if options.hair is None else {"influence": _influence(options.hair)}
+    wish = Wish(
+        options.curl_diameter,
+        options.length,
+        options.waves,
+        options.after_wash,
+        options.weight,
+        options.disulfide_left,
+        **influence,
+    )
+    folder = None if options.output is None else Path(options.output)
+    if folder is not None:
+        check_new_folder(folder, FILES, overwrite=options.overwrite)
+    with Progress("designing", STAGES, unit="stage", shown=not options.quiet) as bar:
+
+        def progress(done: int, doing: str) -> None:
+            bar.update(done - bar.done, doing)
+
+        try:
+            found = design(wish, verify=options.check, progress=progress)
+        except Unreachable as error:
+            bar.close()
+            told(error)
+            return FAILED
+    print(json.dumps(as_json(found), indent=2) if options.json else as_text(found))
+    if folder is not None:
+        wrote(options, write(found, folder, overwrite=options.overwrite))
+    return OK if found.met else FAILED
 
 
 def _influence(path: str) -> tuple[float, ...]:
@@ -88,7 +108,7 @@ def _influence(path: str) -> tuple[float, ...]:
         numbers = json.loads(Path(path).read_text(encoding="utf-8"))["parameters"]
         return tuple(float(numbers[f"bonds.influence[{kind}]"]["value"]) for kind in BONDS)
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise ValueError(f"--hair is {path}; it must be a fit.json with bonds.influence") from None
+        raise Mistake(f"--hair is {path}; it must be a fit.json with bonds.influence") from None
 
 
 def write(found: Design, folder: Path, *, overwrite: bool = False) -> list[Path]:
@@ -113,7 +133,7 @@ def write(found: Design, folder: Path, *, overwrite: bool = False) -> list[Path]
             overwrite=overwrite,
         )
     except ImportError as error:
-        print(f"no picture: {error}")
+        print(f"no picture: {error}", file=sys.stderr)
         return paths[:2]
     return paths
 

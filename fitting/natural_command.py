@@ -3,66 +3,75 @@
 import argparse
 import json
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from fitting.command_line import STRAND_UNITS, add_strand_files, add_work, status
+from fitting.command_line import STRAND_UNITS, add_strand_files
 from fitting.many import SHARES, FitEach, quantiles
 from fitting.measures import curl
 from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
 from fitting.report import plain, versions
-from jaxhair import BONDS, Curves, check, read_strands, write_curves
-from jaxhair.__main__ import parsed
+from jaxhair import BONDS, Curves, read_strands, write_curves
+from jaxhair.command_line import OK, Mistake, Parser, status, wrote
 from jaxhair.export import check_new
+from jaxhair.options import Switch, add_checkpoint, add_json, add_output, add_quiet, whole
 from jaxhair.output import new_file
+from jaxhair.progress import Progress
 
 REPORT, PICTURE = "natural.json", "natural.png"
 STRANDS = {state: f"{state}.hair" for state in (STATE, UNLOADED, REMEMBERED)}
-SECONDS = 5.0
-"""Between two lines of progress, where there are many."""
+STEPS = 30
+"""Simulations of a fit, at most."""
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line's parser."""
-    top = argparse.ArgumentParser(
-        prog="python -m fitting natural",
-        description="Finds for each strand of a file the shape that its bonds must remember for it "
-        "to hang as it does; and, where the same strands were seen without weight too, its "
-        "hydrogen bonds' influence and its cuticle's peeling rate, with their intervals. Says how "
-        "near each strand comes, and which strands cannot be fitted and why.",
-        epilog=f"Writes {REPORT}, {PICTURE} and, of the strands that were fitted, "
-        f"{STRANDS[STATE]} (as simulated) and {STRANDS[REMEMBERED]} (as they are remembered). "
-        "example: python -m fitting natural head.hair --unit cm --up y --output natural",
+def parser() -> Parser:
+    """The command's parser."""
+    top = Parser(
+        "python -m fitting natural",
+        "Finds for each strand of a file the shape that its bonds must remember for it to hang as "
+        "it does; and, where the same strands were seen without weight too, its hydrogen bonds' "
+        "influence and its cuticle's peeling rate, with their intervals. Says how near each strand "
+        "comes, and which strands cannot be fitted and why.",
+        [
+            "python -m fitting natural head.hair --unit cm --up y --output natural",
+            "python -m fitting natural hanging.hair --unloaded floating.hair --output natural",
+        ],
+        [
+            f"Writes {REPORT}, {PICTURE} and, of the strands that were fitted, {STRANDS[STATE]} "
+            f"(as simulated), {STRANDS[REMEMBERED]} (as they are remembered) and, with --unloaded, "
+            f"{STRANDS[UNLOADED]}."
+        ],
     )
-    top.add_argument("file", metavar="FILE", help="strands as they hang: .hair, .data, .npz or USD")
-    top.add_argument("--unloaded", metavar="FILE", help="the same strands without weight")
+    add = top.add_argument
+    add("file", metavar="FILE", help="strands as they hang: .hair, .data, .npz or USD")
+    add("--unloaded", metavar="FILE", help="the same strands without weight")
     add_strand_files(top)
-    top.add_argument("--strands", type=int, help="how many to use at most, spread evenly (all)")
-    top.add_argument("--points", type=int, help="points on a simulated strand (17 to 65)")
-    top.add_argument(
-        "--no-weight", action="store_true", help="FILE shows strands without weight, as modelled"
+    add("--strands", type=whole(1), help="how many to use at most, spread evenly (default: all)")
+    add("--points", type=whole(4), help="points on a simulated strand (default: 17 to 65)")
+    add(
+        "--weight",
+        action=Switch,
+        default=True,
+        help="FILE shows strands without weight, as modelled",
     )
-    top.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
-    add_work(top)
+    add_output(top, (REPORT, PICTURE, *STRANDS.values()))
+    add_json(top)
+    add_checkpoint(top)
+    add_quiet(top)
     return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fits, prints and writes; returns 0, or 2 after a mistake in the request, or 130 after
-    Ctrl-C."""
-    return status(_natural, parsed(parser(), arguments))
+    """Runs the command; returns its exit code."""
+    return status(parser(), _natural, arguments)
 
 
 def _natural(options: argparse.Namespace) -> int:
-    for name, least in (("strands", 1), ("points", 4)):
-        if getattr(options, name) is not None:
-            check.whole(f"--{name}", getattr(options, name), least=least)
-    if options.unloaded is not None and options.no_weight:
-        raise ValueError("--no-weight is for strands of one file; leave out it or --unloaded")
+    if options.unloaded is not None and not options.weight:
+        raise Mistake("--no-weight is for strands of one file; leave out it or --unloaded")
     unit = None if options.unit is None else STRAND_UNITS[options.unit]
     files = [options.file] + ([] if options.unloaded is None else [options.unloaded])
     seen = [read_strands(path, unit=unit, up=options.up) for path in files]
@@ -72,23 +81,24 @@ def _natural(options: argparse.Namespace) -> int:
     for name in (REPORT, PICTURE, *(STRANDS[state] for state in states)):
         check_new(folder / name, overwrite=options.overwrite)
     kept = None if options.checkpoint is None else Path(options.checkpoint)
-    if not options.quiet:
-        print(f"Fitting {len(seen[0])} strands. The first simulations include compilation.")
-    hair = natural(
-        seen[0],
-        unloaded=None if len(seen) == 1 else seen[1],
-        points=options.points,
-        weight=not options.no_weight,
-        strands=options.strands,
-        seconds=0.5 if len(seen) == 1 else 1.5,
-        progress=None if options.quiet else _holding(),
-        checkpoint=None if kept is None else kept / "stiffness",
-    )
-    found = hair.fit(
-        progress=None if options.quiet else _fitting(),
-        checkpoint=None if kept is None else kept / "fit",
-    )
-    print(hair.table(found))
+    shown = not options.quiet
+    with Progress("shapes to remember, at most", None, unit="strand", shown=shown) as bar:
+        hair = natural(
+            seen[0],
+            unloaded=None if len(seen) == 1 else seen[1],
+            points=options.points,
+            weight=options.weight,
+            strands=options.strands,
+            seconds=0.5 if len(seen) == 1 else 1.5,
+            progress=lambda done, left: bar.update(done - bar.done, total=done + left),
+            checkpoint=None if kept is None else kept / "stiffness",
+        )
+    # strands that are fitted drop out, so that no simulation of all is slower than the one before
+    with Progress("fitting, at most", STEPS, unit="simulation", shown=shown) as bar:
+        found = hair.fit(
+            progress=lambda step, mm: bar.update(step - bar.done, f"residual {mm:.4g} mm"),
+            checkpoint=None if kept is None else kept / "fit",
+        )
     written = write(
         hair,
         found,
@@ -98,48 +108,10 @@ def _natural(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         files=[str(path) for path in files],
     )
-    print("wrote " + ", ".join(str(path) for path in written))
-    return 0
-
-
-def _holding() -> Any:
-    """Prints how the search for what strands must remember goes on, every few seconds."""
-    began = shown = time.monotonic()
-    compiled: tuple[float, int] | None = None
-
-    def progress(done: int, left: int) -> None:
-        nonlocal shown, compiled
-        now = time.monotonic()
-        compiled = compiled or (now, done)
-        if now - shown > SECONDS and done > compiled[1]:
-            shown = now
-            rate = (done - compiled[1]) / (now - compiled[0])
-            print(
-                f"  shapes to remember: {done} strands simulated, {now - began:.0f} s, at most "
-                f"{left / rate:.0f} s left",
-                flush=True,
-            )
-
-    return progress
-
-
-def _fitting(steps: int = 30) -> Any:
-    """Prints how the fit goes on; strands that are fitted drop out, so that no simulation of all
-    takes longer than the one before."""
-    began = last = time.monotonic()
-    first = True
-
-    def progress(step: int, residual: float) -> None:
-        nonlocal last, first
-        now = time.monotonic()
-        left = "" if first else f", at most {(now - last) * (steps - step):.0f} s left"
-        last, first = now, False
-        print(
-            f"  simulation {step:2d}: residual {residual:.4g} mm, {now - began:.0f} s{left}",
-            flush=True,
-        )
-
-    return progress
+    report = written[0].read_text(encoding="utf-8").strip()
+    print(report if options.json else hair.table(found))
+    wrote(options, written)
+    return OK
 
 
 def write(
@@ -176,7 +148,7 @@ def write(
         picture(folder / PICTURE, hair, found, overwrite=overwrite)
         paths.append(folder / PICTURE)
     except ImportError as error:
-        print(f"no picture: {error}")
+        print(f"no picture: {error}", file=sys.stderr)
     return paths
 
 

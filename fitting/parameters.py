@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any
 
 import jax
@@ -12,6 +11,7 @@ from jax import Array
 
 from fitting.constraints import Constraint, PerExperiment, PerStrand
 from jaxhair import Scene, check, named_leaves, replace_leaves
+from jaxhair.scene import matching
 from jaxhair.strands import BONDS
 
 NEAR_A_BOUND = 1e-3
@@ -183,14 +183,6 @@ def check_alike(name: str, values: Sequence[np.ndarray]) -> None:
     if any(v.shape != values[0].shape or np.any(v != values[0]) for v in values):
         shown = check.short(name)
         raise ValueError(f"free names {shown}, whose leaves start with different values")
-
-
-def matching(name: Any, leaves: Iterable[str]) -> list[str]:
-    """The leaf of a name, or all that it matches with a `*`."""
-    names = list(leaves)
-    if name in names or not isinstance(name, str):
-        return [name] if name in names else []
-    return [leaf for leaf in names if fnmatchcase(leaf, name)]
 
 
 def unknown(name: Any, leaves: Iterable[str]) -> ValueError:

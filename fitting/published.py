@@ -1,4 +1,4 @@
-"""Published perms, predicted: `python -m fitting.published --output DIR`.
+"""Published perms, predicted: `python -m fitting published --output DIR`.
 
 For nine perm lotions the literature gives two moduli, in % of the intact hair's in water: E_re
 after reduction and E_ro after re-oxidation, and the set that the same hair took. The moduli
@@ -29,7 +29,6 @@ What is assumed:
   hair's section as even, so the two are the same; reduction from the outside in would part them.
 """
 
-import argparse
 import csv
 import json
 import sys
@@ -47,9 +46,7 @@ from scipy.optimize import least_squares
 
 import jaxhair as jh
 from fitting.measures import curl
-from jaxhair.__main__ import parsed
 from jaxhair.bonds import per_inner_point, springs
-from jaxhair.export import check_new
 from jaxhair.output import new_file
 from jaxhair.treatments import AT_ONCE
 
@@ -249,7 +246,7 @@ def write(made: Sequence[Lotion], folder: Path, *, overwrite: bool = False) -> l
     try:
         picture(image, made, overwrite=overwrite)
     except ImportError as error:
-        print(f"no picture: {error}")
+        print(f"no picture: {error}", file=sys.stderr)
         paths.remove(image)
     return paths
 
@@ -288,38 +285,3 @@ def picture(path: Path, made: Sequence[Lotion], *, overwrite: bool = False) -> N
         axes.set_axisbelow(True)
     with new_file(path, overwrite=overwrite) as temporary:
         drawing.savefig(temporary)
-
-
-def parser() -> argparse.ArgumentParser:
-    """The command line's parser."""
-    top = argparse.ArgumentParser(
-        prog="python -m fitting published",
-        description="Predicts the set of nine published perm lotions: fits the bonds that each "
-        "cuts and re-forms to the hair's measured moduli, simulates the perm, and compares the "
-        "curl with the set that was measured.",
-    )
-    top.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
-    top.add_argument("--overwrite", action="store_true", help="replace files in DIR")
-    return top
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Predicts, prints and writes; returns 0, or 2 after a mistake in the request."""
-    options = parsed(parser(), arguments)
-    folder = Path(options.output)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in FILES:
-            check_new(folder / name, overwrite=options.overwrite)
-        made = predictions(lotions())
-        print(table(made))
-        written = write(made, folder, overwrite=options.overwrite)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print("wrote " + ", ".join(str(path) for path in written))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

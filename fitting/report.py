@@ -2,6 +2,7 @@
 
 import json
 import platform
+import sys
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -143,7 +144,7 @@ def write(fit: "Fit", folder: Path, *, overwrite: bool = False, **more: Any) -> 
         )
         paths.append(picture)
     except ImportError as error:
-        print(f"no picture: {error}")
+        print(f"no picture: {error}", file=sys.stderr)
     return paths
 
 

@@ -11,10 +11,11 @@ import numpy as np
 from jax import Array
 
 from fitting.constraints import Constraint
-from fitting.parameters import OWN_AXES, check_alike, check_free, matching, unknown
+from fitting.parameters import OWN_AXES, check_alike, check_free, unknown
 from fitting.processes import shared
 from fitting.targets import MM, Shape, Target
 from jaxhair import Scene, check, named_leaves, run
+from jaxhair.scene import matching
 from jaxhair.strands import strands_last
 
 TILE = 64

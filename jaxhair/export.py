@@ -13,6 +13,7 @@ from jaxhair.extras import optional
 from jaxhair.files import Curves, write_curves
 from jaxhair.obstacles import Mesh, Obstacle
 from jaxhair.output import new_file
+from jaxhair.progress import each
 from jaxhair.recording import Recording
 from jaxhair.scene import Scene, named_leaves
 from jaxhair.strands import BONDS
@@ -189,11 +190,7 @@ def _draw(
         return
 
     def bar(frames: range) -> Any:
-        if not progress:
-            return frames
-        from tqdm import tqdm
-
-        return tqdm(frames, unit="frame", desc="drawing")
+        return each(frames, "drawing", unit="frame", shown=progress)
 
     times = np.asarray(recording.times)
     pictures.movie(

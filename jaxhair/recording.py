@@ -13,6 +13,7 @@ from jax import Array, lax
 
 from jaxhair import check, diagnosis, tiles
 from jaxhair.kernels import allowed
+from jaxhair.progress import Progress
 from jaxhair.pytree import pytree, static
 from jaxhair.saved_frames import SavedFrames
 from jaxhair.scene import Phase, Scene
@@ -232,7 +233,7 @@ def _interruptible(
 ) -> tuple[list[Any], bool, Failure | None]:
     """Frame by frame, with a progress bar, until the end, Ctrl-C or a value that is not finite."""
     total = sum(phase.steps(scene.dt) for phase in scene.phases)
-    bar = _bar(total, progress)
+    bar = Progress("simulating", total, unit="step", shown=progress)
     bare = replace(scene, phases=())
     frames = saved.frames or [jax.tree.map(np.asarray, observe(saved.state))]
     # how many frames, and the state after them, in one object: Ctrl-C may come at any statement
@@ -271,20 +272,6 @@ def _interruptible(
 def _finite(tree: Any) -> bool:
     leaves = (np.asarray(leaf) for leaf in jax.tree.leaves(tree))
     return all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
-
-
-class _NoBar:
-    def update(self, steps: int) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def _bar(total: int, progress: bool) -> Any:
-    if not progress:
-        return _NoBar()
-    from tqdm import tqdm
-
-    return tqdm(total=total, unit="step", desc="simulating")
 
 
 def _message(

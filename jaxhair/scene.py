@@ -1,7 +1,8 @@
 """A scene: strands, their fibre and bonds, and the phases that they go through. Plain data."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 import jax
@@ -217,6 +218,14 @@ def replace_leaves(scene: Scene, values: Mapping[str, Any]) -> Scene:
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: values.get(_name(path, scene), leaf), scene
     )
+
+
+def matching(name: Any, leaves: Iterable[str]) -> list[str]:
+    """The leaf of a name, or all that it matches with a `*`."""
+    names = list(leaves)
+    if name in names or not isinstance(name, str):
+        return [name] if name in names else []
+    return [leaf for leaf in names if fnmatchcase(leaf, name)]
 
 
 def _name(path: tuple[Any, ...], scene: Scene) -> str:

@@ -227,9 +227,9 @@ def test_bad_commands(
     with monkeypatch.context() as patched:
         patched.chdir(tmp_path)
         for module, function in (
-            ("jaxhair.__main__", "simulate"),
+            ("jaxhair.simulate_command", "simulate"),
             ("jaxhair.accuracy.command", "_measured"),
-            ("fitting.__main__", "fit"),
+            ("fitting.fit_command", "fit"),
         ):
             patched.setattr(sys.modules[module], function, reached)
         (tmp_path / "out").mkdir(exist_ok=True)
@@ -254,7 +254,7 @@ def test_bad_commands(
         event("refused")
         assert code == 2
         lines = capsys.readouterr().err.splitlines()
-        if not lines[0].startswith("usage:"):
+        if lines:
             assert len(lines) == 1
             assert lines[0].startswith("error: ")
             assert len(lines[0]) < 600

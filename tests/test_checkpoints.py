@@ -263,7 +263,7 @@ def test_the_commands_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The same command again, after Ctrl-C: no output is in its way."""
-    monkeypatch.setattr("jaxhair.__main__._scene", lambda options: scene())
+    monkeypatch.setattr("jaxhair.simulate_command.scene_of", lambda options: scene())
     path, folder = tmp_path / "perm.npz", tmp_path / "kept"
     command = ["simulate", "perm", "--fps", "90", "--quiet", "--output", str(path)]
     command += ["--checkpoint", str(folder)]
@@ -279,7 +279,7 @@ def test_the_commands_go_on(
         assert options["checkpoint"] == str(folder)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fitting.__main__.fit", interrupted)
+    monkeypatch.setattr("fitting.fit_command.fit", interrupted)
     command = ["--output", str(tmp_path / "fitted"), "--checkpoint", str(folder), "--quiet"]
     assert fit_main(command) == 130
     assert capsys.readouterr().err == f"interrupted; the same command goes on from {folder}\n"

@@ -66,7 +66,7 @@ def test_a_curl_that_cannot_be_had_is_refused_with_the_nearest() -> None:
 def test_the_command_writes_and_prints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fitting.design_command.design", lambda wish, verify: of_25_mm())
+    monkeypatch.setattr("fitting.design_command.design", lambda *_, **__: of_25_mm())
     (tmp_path / "fit.json").write_text(
         json.dumps(
             {

@@ -278,7 +278,7 @@ def test_a_diagnosis_that_fails_hides_nothing(
 def test_the_command_keeps_the_frames_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("jaxhair.__main__._scene", lambda options: scene(Breaks(1, 4)))
+    monkeypatch.setattr("jaxhair.simulate_command.scene_of", lambda options: scene(Breaks(1, 4)))
     path = tmp_path / "broken.npz"
     assert main(["simulate", "perm", "--fps", "72", "--quiet", "--output", str(path)]) == 1
     printed = capsys.readouterr()
@@ -299,8 +299,8 @@ def test_the_command_cannot_keep_the_frames_before(
     def full(*_: Any, **__: Any) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr("jaxhair.__main__._scene", lambda options: scene(Breaks(1, 4)))
-    monkeypatch.setattr("jaxhair.__main__.save", full)
+    monkeypatch.setattr("jaxhair.simulate_command.scene_of", lambda options: scene(Breaks(1, 4)))
+    monkeypatch.setattr("jaxhair.simulate_command.save", full)
     path = tmp_path / "broken.npz"
     assert main(["simulate", "perm", "--fps", "72", "--quiet", "--output", str(path)]) == 1
     first, second = capsys.readouterr().err.splitlines()

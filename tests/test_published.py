@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting import published
+from fitting import published, published_command
 from fitting.published import FILES, INFLUENCE, Lotion
 
 DATA = Path(__file__).parent / "data" / "perm_set.csv"
@@ -142,7 +142,7 @@ def test_the_ninth_is_listed_with_its_reason() -> None:
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It writes three files that agree, refuses to replace them, and does with --overwrite."""
     folder = tmp_path / "new" / "results"
-    assert published.main(["--output", str(folder)]) == 0
+    assert published_command.main(["--output", str(folder)]) == 0
     assert published.table(made()) in capsys.readouterr().out
     assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
     assert (folder / "published.png").read_bytes().startswith(b"\x89PNG")
@@ -159,14 +159,14 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         for other in FILES:
             (folder / other).unlink(missing_ok=True)
         (folder / name).write_text("mine")
-        assert published.main(["--output", str(folder)]) == 2
+        assert published_command.main(["--output", str(folder)]) == 2
         said = capsys.readouterr()
         assert name in said.err
         assert "--overwrite" in said.err
         assert not said.out  # refused before any work
         assert [path.name for path in folder.iterdir()] == [name]
         assert (folder / name).read_text() == "mine"
-    assert published.main(["--output", str(folder), "--overwrite"]) == 0
+    assert published_command.main(["--output", str(folder), "--overwrite"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
     assert (folder / "published.png").read_bytes().startswith(b"\x89PNG")
 
@@ -178,5 +178,5 @@ def test_without_matplotlib_the_rest_is_written(
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     rows = [replace(b) for b in made()]
     assert [p.name for p in published.write(rows, tmp_path)] == list(FILES[:2])
-    assert "jaxhair[pictures]" in capsys.readouterr().out
+    assert "jaxhair[pictures]" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES[:2])

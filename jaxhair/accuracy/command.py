@@ -2,57 +2,69 @@
 
 import argparse
 import csv
+import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 
-from jaxhair import check
 from jaxhair.accuracy import grid, table
 from jaxhair.accuracy.grid import Plan
 from jaxhair.accuracy.measuring import Row, measure
 from jaxhair.accuracy.problem import PARAMETERS, Reference, reference
 from jaxhair.accuracy.stretch import Stretch, stretch
+from jaxhair.command_line import INTERRUPTED, OK, Parser, status, wrote
 from jaxhair.export import check_new_folder
 from jaxhair.extras import optional
+from jaxhair.options import Switch, add_json, add_output, add_quiet, whole
 from jaxhair.output import new_file
+from jaxhair.progress import each
 
 FILES = ("accuracy.csv", "accuracy.json", "stretch.csv", "accuracy.png", "theory.png")
 BASE_ITERATIONS = 5
 """With which the substeps are swept."""
 
-T = TypeVar("T")
 
-
-def add_command(commands: Any) -> None:
-    """Add the command to those of a parser."""
-    parser = commands.add_parser(
-        "accuracy",
-        help="measure what accuracy costs, for every setting",
-        description="Measures error, time and memory of solvers, iterations, substeps, time "
-        "steps, points and dtypes on a perm that springs off its rod, for the final shape and for "
-        "a reverse-mode gradient, against a fine reference whose own error is bounded. Writes "
+def parser() -> Parser:
+    """The command's parser."""
+    top = Parser(
+        "python -m jaxhair accuracy",
+        "Measures error, time and memory of solvers, iterations, substeps, time steps, points "
+        "and dtypes on a perm that springs off its rod, for the final shape and for a "
+        "reverse-mode gradient, against a fine reference whose own error is bounded. Writes "
         "work-precision diagrams (accuracy.png), their numbers (accuracy.csv, accuracy.json) and "
         "how the paper's solver stretches a hanging strand (theory.png, stretch.csv), and prints "
-        "the cheapest settings for some errors. Nothing else should run meanwhile. Ctrl-C "
-        "keeps what was measured.",
-        epilog="example: python -m jaxhair accuracy --quick --output accuracy. In Python, "
-        'jaxhair.cheapest(0.01, table="accuracy/accuracy.csv") gives the settings for 1 %%.',
+        "the cheapest settings for some errors. Nothing else should run meanwhile. Ctrl-C keeps "
+        "what was measured.",
+        [
+            "python -m jaxhair accuracy --quick --output quick",
+            "python -m jaxhair accuracy --strands 200 --output accuracy",
+        ],
+        [
+            'In Python, jaxhair.cheapest(0.01, table="accuracy/accuracy.csv") gives the settings '
+            "for an error of 1 %."
+        ],
     )
-    parser.add_argument("--output", required=True, metavar="DIR", help="folder for the results")
-    parser.add_argument("--quick", action="store_true", help="a few settings, coarser reference")
-    parser.add_argument("--strands", type=int, default=64, help="that are timed together (64)")
-    parser.add_argument("--overwrite", action="store_true", help="replace files in DIR")
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    add_output(top, FILES)
+    add = top.add_argument
+    add("--quick", action=Switch, help="a few settings, coarser reference")
+    add("--strands", type=whole(1), default=64,
+        help="number of strands that are timed together (default: %(default)d)")  # fmt: skip
+    add_json(top)
+    add_quiet(top)
+    return top
 
 
-def run(options: argparse.Namespace) -> int:
-    """Runs the command; returns 0, or 130 if it was interrupted."""
-    check.whole("--strands", options.strands, least=1)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return status(parser(), _accuracy, arguments)
+
+
+def _accuracy(options: argparse.Namespace) -> int:
     plan = grid.plan(strands=options.strands, quick=options.quick)
     optional("matplotlib")
     folder = Path(options.output)
@@ -60,14 +72,18 @@ def run(options: argparse.Namespace) -> int:
     results = _measured(plan, progress=not options.quiet)
     if results.reference is None or not results.rows:
         print("interrupted: nothing was measured yet", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     written = _write(plan, results, folder, overwrite=options.overwrite)
-    print(_report(plan, results))
-    print("wrote " + ", ".join(str(path) for path in written))
+    if options.json:
+        whole = {**description(plan, results), "settings": table.as_json(results.rows)}
+        print(json.dumps(whole, indent=2))
+    else:
+        print(_report(plan, results))
+    wrote(options, written)
     if not results.complete:
         kept = f"{len(results.rows)} of {len(plan.settings)} settings"
         print(f"interrupted: {kept} are kept", file=sys.stderr)
-    return 0 if results.complete else 130
+    return OK if results.complete else INTERRUPTED
 
 
 @dataclass
@@ -96,30 +112,17 @@ def _measured(plan: Plan, *, progress: bool) -> Results:
         )
         if progress:
             print(results.reference, file=sys.stderr, flush=True)
-        for setting in _shown(plan.settings, "measuring", progress):
+        for setting in each(plan.settings, "measuring", unit="setting", shown=progress, said=str):
             results.rows.append(measure(plan.problem, results.reference, setting))
-        for iterations, substeps in _shown(
-            list(wanted), "iterations and substeps of a hanging strand", progress
+        title = "iterations and substeps of a hanging strand"
+        for iterations, substeps in each(
+            list(wanted), title, unit="setting", shown=progress, said=str
         ):
             results.stretches.append(stretch(iterations, substeps))
     except KeyboardInterrupt:
         return results
     results.complete = True
     return results
-
-
-def _shown(items: Sequence[T], title: str, progress: bool) -> Iterator[T]:
-    """The items, with a progress bar that names the present one."""
-    if not progress:
-        yield from items
-        return
-    from tqdm import tqdm
-
-    with tqdm(total=len(items), desc=title, unit="setting") as bar:
-        for item in items:
-            bar.set_postfix_str(str(item))
-            yield item
-            bar.update()
 
 
 def _write(plan: Plan, results: Results, folder: Path, *, overwrite: bool) -> list[Path]:
@@ -197,3 +200,7 @@ def _report(plan: Plan, results: Results) -> str:
             table.recommended(rows, gradient=True),
         ]
     return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

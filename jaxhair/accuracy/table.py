@@ -213,6 +213,25 @@ def write_json(path: Path, content: Any, *, overwrite: bool) -> None:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
+def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Rows as plain data by `COLUMNS`; what does not apply or is not known is None."""
+    return [
+        {name: _plain(cell) for name, cell in zip(COLUMNS, _cells(row), strict=True)}
+        for row in rows
+    ]
+
+
+def _plain(cell: Any) -> Any:
+    """A cell as JSON has it: numbers are not texts."""
+    if not isinstance(cell, str):
+        return cell
+    try:
+        number = float(cell)
+    except ValueError:
+        return cell or None
+    return number if math.isfinite(number) else None
+
+
 def _cells(row: Row) -> list[Any]:
     solver: Any = row.setting.solver
     costs: list[Any] = []

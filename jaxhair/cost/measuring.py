@@ -1,7 +1,7 @@
 """Time, operations and memory of a scene's step, and what each part adds to them."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxhair import check
 from jaxhair.cost.parts import Plan, Variant, plan
+from jaxhair.progress import each
 from jaxhair.scene import Phase, Scene
 from jaxhair.simulate import phase_end, start
 from jaxhair.strands import State
@@ -159,7 +160,13 @@ def measured(
     bench = _Bench(state, steps, repeat, {})
     costs = tuple(
         _phase_cost(bench, bare, phases, gradients)
-        for phases in _shown(_alike(numbers.phases), progress)
+        for phases in each(
+            _alike(numbers.phases),
+            "measuring",
+            unit="phase",
+            shown=progress,
+            said=lambda phases: phases[0].name,
+        )
     )
     return SceneCost(scene, costs, steps, repeat)
 
@@ -170,19 +177,6 @@ def _alike(phases: Sequence[Phase]) -> list[list[Phase]]:
     for phase in phases:
         groups.setdefault(tuple(type(e) for e in phase.effects), []).append(phase)
     return list(groups.values())
-
-
-def _shown(groups: list[list[Phase]], progress: bool) -> Iterator[list[Phase]]:
-    if not progress:
-        yield from groups
-        return
-    from tqdm import tqdm
-
-    with tqdm(total=len(groups), desc="measuring", unit="phase") as bar:
-        for phases in groups:
-            bar.set_postfix_str(phases[0].name)
-            yield phases
-            bar.update()
 
 
 @dataclass(frozen=True)
