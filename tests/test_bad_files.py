@@ -5,11 +5,11 @@ How to make 2,000 of them stands in test_bad_input.py.
 
 import io
 import struct
-import sys
 import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -231,7 +231,7 @@ def test_bad_commands(
             ("jaxhair.accuracy.command", "_measured"),
             ("fitting.fit_command", "fit"),
         ):
-            patched.setattr(sys.modules[module], function, reached)
+            patched.setattr(import_module(module), function, reached)
         (tmp_path / "out").mkdir(exist_ok=True)
         jh.write_curves("there.hair", CURVES, overwrite=True)
         Path("broken.toml").write_bytes(b"[[[")
