@@ -63,6 +63,7 @@ def test_the_reference_s_bound_holds_against_a_finer_one() -> None:
     assert problem.shape_error(TINY, coarse, finer.shape[:, :, None]) < coarse.bound
 
 
+@pytest.mark.slow
 def test_the_reference_s_gradient_is_that_of_forward_mode() -> None:
     _, gradient = problem._shape_and_gradient(TINY, 9, 80)
     solver = jh.Direct(newton_steps=2, frame_inertia=1e-6)

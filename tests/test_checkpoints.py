@@ -229,7 +229,11 @@ def tiny_fit_each(checkpoint: str | None) -> fitting.FitEach:
 
 @pytest.mark.parametrize(
     "method",
-    ["levenberg-marquardt", "adam", pytest.param("l-bfgs", marks=pytest.mark.slow)],
+    [
+        "levenberg-marquardt",
+        pytest.param("adam", marks=pytest.mark.slow),
+        pytest.param("l-bfgs", marks=pytest.mark.slow),
+    ],
 )
 def test_a_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     monkeypatch.setattr(sys.modules["fitting.optimisers"], "JOURNAL_SECONDS", 0.0)
