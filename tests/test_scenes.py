@@ -159,3 +159,15 @@ def test_first_keeps_the_beginning_of_a_scene() -> None:
     assert [p.name for p in scene.first(1.5).phases] == ["lie down", "asleep"]
     assert scene.first(1.5).duration == pytest.approx(1.5)
     assert scene.first(99.0).duration == pytest.approx(scene.duration)
+
+
+def test_a_simulated_winding_stays_on_the_rod() -> None:
+    """All that was taken up lies about the rod at the end; its edges cut 3.5 mm deep into it."""
+    radius = 0.03
+    scene = jh.scenes.perm(strands=2, points=33, rod_diameter=2 * radius, contact=False)
+    wind = scene.phases[0]
+    points = jh.run(replace(scene, phases=(wind,)))[wind.name].points[:, 16:]
+    axis = np.array([radius, 2 * radius + 0.8 * 0.48])
+    distance = np.linalg.norm(np.asarray(points)[..., [0, 2]] - axis, axis=-1)
+    assert distance.min() > 0.7 * radius
+    assert distance.max() < 1.2 * radius
