@@ -11,6 +11,12 @@ SECONDS = 10.0
 """Between two lines, where there is no terminal to draw a bar on [s]."""
 
 
+def _in_notebook() -> bool:
+    """Whether a kernel runs this; that its package was imported does not say so."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+
+
 class Progress:
     """A bar on a terminal or in a notebook; elsewhere a line now and then, and one at the end.
 
@@ -30,7 +36,7 @@ class Progress:
         # the first unit of work has compilation in it, so it says little of the others
         self._first: tuple[float, int] | None = None
         self._bar: Any = None
-        if shown and (sys.stderr.isatty() or "ipykernel" in sys.modules):
+        if shown and (sys.stderr.isatty() or _in_notebook()):
             from tqdm import tqdm
 
             self._bar = tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True)

@@ -333,6 +333,9 @@ class Clock:
 def test_progress_without_a_terminal_is_a_line_now_and_then(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Also where a test, or a user, has imported what kernels are made of."""
+    import ipykernel.zmqshell  # noqa: F401
+
     clock = Clock()
     monkeypatch.setattr("jaxhair.progress.time", clock)
     with Progress("working", 40, unit="step") as bar:

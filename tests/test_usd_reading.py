@@ -321,7 +321,7 @@ def test_a_fit_takes_it_as_its_target(
         seen.append(observed)
         raise ValueError("reached")
 
-    monkeypatch.setattr("fitting.__main__.from_strands", reached)
+    monkeypatch.setattr("fitting.fit_command.from_strands", reached)
     path = tmp_path / "released.usd"
     strand = np.linspace([0.0, 0, 0.3], [0.0, 0, 0], 9)
     jh.write_curves(path, jh.Curves.from_list([strand]), unit=0.01, up="y")
