@@ -16,7 +16,7 @@ from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
 from fitting.report import plain, versions
 from jaxhair import BONDS, Curves, read_strands, write_curves
 from jaxhair.command_line import OK, Mistake, Parser, status, wrote
-from jaxhair.export import check_new
+from jaxhair.export import check_new_folder
 from jaxhair.options import Switch, add_checkpoint, add_json, add_output, add_quiet, whole
 from jaxhair.output import new_file
 from jaxhair.progress import Progress
@@ -76,10 +76,9 @@ def _natural(options: argparse.Namespace) -> int:
     files = [options.file] + ([] if options.unloaded is None else [options.unloaded])
     seen = [read_strands(path, unit=unit, up=options.up) for path in files]
     folder = Path(options.output)
-    folder.mkdir(parents=True, exist_ok=True)
     states = (STATE, REMEMBERED) if options.unloaded is None else (STATE, UNLOADED, REMEMBERED)
-    for name in (REPORT, PICTURE, *(STRANDS[state] for state in states)):
-        check_new(folder / name, overwrite=options.overwrite)
+    names = (REPORT, PICTURE, *(STRANDS[state] for state in states))
+    check_new_folder(folder, names, overwrite=options.overwrite)
     kept = None if options.checkpoint is None else Path(options.checkpoint)
     shown = not options.quiet
     with Progress("shapes to remember, at most", None, unit="strand", shown=shown) as bar:

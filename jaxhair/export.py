@@ -176,7 +176,9 @@ def _draw(
     from jaxhair import pictures
 
     scene, counts = recording.scene, recording.scene.strands.counts
-    bonded = None if color_by is None else _bonded(recording.fractions, color_by)
+    bonded = None
+    if color_by is not None:
+        bonded = recording.fractions_at_points()[..., BONDS.index(color_by)]
     if Path(path).suffix.lower() == ".png":
         pictures.picture(
             path,
@@ -206,14 +208,6 @@ def _draw(
         progress=bar,
         **drawing,
     )
-
-
-def _bonded(fractions: Any, kind: str) -> np.ndarray:
-    """Fractions at all points, (frames, strands, points): the ends have their neighbours'."""
-    inner = np.asarray(fractions)[..., BONDS.index(kind)]
-    if inner.shape[-1] == 0:
-        return np.ones((*inner.shape[:-1], 2))
-    return np.pad(inner, [(0, 0)] * (inner.ndim - 1) + [(1, 1)], mode="edge")
 
 
 def meshes(scene: Scene, phase: str, time: float) -> list[Mesh]:

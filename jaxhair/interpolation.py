@@ -5,7 +5,7 @@ curves join the points of each.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -65,6 +65,11 @@ class Interpolation:
             shade=np.exp(random.normal(0, 0.18, hairs)),
             reach=reach,
         )
+
+    def part(self, rows: slice) -> "Interpolation":
+        """Some of the hairs."""
+        each = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "reach"}
+        return replace(self, **each)
 
     def hairs(self, points: Array, counts: Array) -> Array:
         """All hairs [m], shape (hairs, points, 3)."""

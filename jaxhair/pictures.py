@@ -237,11 +237,23 @@ class _Scene:
         camera, added = self.stage.camera, self.interpolation
         points = self.frames[index].astype(np.float32)
         used = self.used[added.guide]
-        # Curves are cut into pieces of about five pixels, so that no corner shows.
+        # One pixel of 800 where hairs are many, up to two where they are few.
+        pixels = min((2000 / len(added.guide)) ** 0.25, 2) * min(camera.size) / 800
+        # Curves are cut into pieces of about five pixels, so that no corner shows; nobody looks
+        # at one of very many hairs.
+        piece = 5 * max(1, min(camera.size) / 800 / pixels)
         depth = max(float(np.min(camera.project(points)[..., 2])), 0.1 * self.stage.radius)
         longest = np.max(np.linalg.norm(np.diff(points, axis=1), axis=-1)) / depth * camera.focal
-        pieces = int(np.clip(np.ceil(longest / 5), 1, 16))
-        curves, rates = bezier(added.hairs(points, self.used), used, pieces)
+        pieces = int(np.clip(np.ceil(longest / piece), 1, 16))
+
+        def grown(rows: slice) -> tuple[Array, Array]:
+            hairs = added.part(rows).hairs(points, self.used)
+            curves, rates = bezier(hairs, used[rows], pieces)
+            return curves.astype(np.float32), shading.unit(rates).astype(np.float32)
+
+        parts = [slice(first, first + 512) for first in range(0, len(used), 512)]
+        found = raster.in_threads(grown, parts)
+        curves, tangents = (np.concatenate(x) for x in zip(*found, strict=True))
         steps = np.arange(curves.shape[1])
         ends = np.ceil((used - 1) * pieces * (1 - added.cut))
         colors = np.broadcast_to(self.color, curves.shape)
@@ -249,13 +261,11 @@ class _Scene:
             place = np.arange(points.shape[1]) * pieces
             rows = [np.interp(steps, place, row) for row in self.bonded[index]]
             colors = shading.bonded_color(np.array(rows))[added.guide]
-        # One pixel of 800 where hairs are many, up to two where they are few.
-        pixels = min((2000 / len(curves)) ** 0.25, 2) * min(camera.size) / 800
         thickness = max(1, round(shading.SUPERSAMPLING * pixels))
         pixel = np.linalg.norm(camera.position - self.stage.centre) / camera.focal
         return shading.Hairs(
-            points=curves.astype(np.float32),
-            tangents=shading.unit(rates).astype(np.float32),
+            points=curves,
+            tangents=tangents,
             colors=(colors * added.shade[:, None, None]).astype(np.float32),
             drawn=steps[:-1] < ends[:, None],
             # A highlight washes out the colours that show the bonds.

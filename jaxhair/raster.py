@@ -5,13 +5,20 @@ Places on an image are in pixels: x to the right, y downwards, the centre of the
 upper half of an entry the bits of the depth, in the lower half the name of what is seen there.
 """
 
+import itertools
 import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from jaxhair import check
 
+S = TypeVar("S")
+T = TypeVar("T")
 Array = np.ndarray
 NOTHING = 0xFFFFFFFF  # the name of what is seen where nothing is
 
@@ -168,24 +175,37 @@ def lines(
     limit = np.array([width, height], np.float32)
     onscreen = np.all((np.maximum(a, b) >= 0) & (np.minimum(a, b) < limit), -1)
     kept, a, b = kept[onscreen], a[onscreen], b[onscreen]
-    depth = start[kept, 2] - np.float32(bias)
+    samples = np.ceil(np.max(np.abs(b - a), -1)).astype(np.int64).clip(1, 4 * max(width, height))
+    # Lines of as many samples come together, and then samples lie lines last: loops are long.
+    order = np.argsort(samples, kind="stable")
+    kept, a, b, samples = kept[order], a[order], b[order], samples[order]
+    origin = np.stack([*a.T, start[kept, 2] - np.float32(bias)])
     change = np.stack([*(b - a).T, end[kept, 2] - start[kept, 2]])
-    across, down = np.abs(change[:2])
-    samples = np.ceil(np.maximum(across, down)).astype(np.int64).clip(1, 4 * max(width, height))
-    chunk = np.cumsum(samples) // 2**19
-    for piece in range(int(chunk[-1]) + 1 if len(chunk) else 0):
-        few = slice(*np.searchsorted(chunk, [piece, piece + 1]))
-        n = samples[few]
-        along = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        along = (along + np.float32(0.5)).astype(np.float32) / np.repeat(n.astype(np.float32), n)
-        x, y, w = (
-            np.repeat(value[few], n) + along * np.repeat(slope[few], n)
-            for value, slope in zip((a[:, 0], a[:, 1], depth), change, strict=True)
-        )
-        key = _key(w, np.repeat(kept[few] * 64, n) + (along * 63).astype(np.int64))
-        steep = np.repeat((down > across)[few].astype(np.float32), n)
-        for shift in np.arange(thickness, dtype=np.float32) - np.float32((thickness - 1) / 2):
-            column = np.floor(x + shift * steep).astype(np.int64)
-            row = np.floor(y + shift * (1 - steep)).astype(np.int64)
-            ok = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            np.minimum.at(buffer, (row * width + column)[ok], key[ok])
+    steep = (np.abs(change[1]) > np.abs(change[0])).astype(np.float32)
+    shifts = np.arange(thickness, dtype=np.float32) - np.float32((thickness - 1) / 2)
+
+    def sample(few: slice) -> None:
+        n = samples[few.start]
+        along = ((np.arange(n) + np.float32(0.5)) / np.float32(n)).astype(np.float32)[:, None]
+        x, y, w = (origin[k, few] + along * change[k, few] for k in range(3))
+        key = _key(w, kept[few] * 64 + (along * 63).astype(np.int64))
+        for shift in shifts:
+            column = np.floor(x + shift * steep[few]).astype(np.int32)
+            row = np.floor(y + shift * (1 - steep[few])).astype(np.int32)
+            place = row.astype(np.int64) * width + column
+            ok = (column.view(np.uint32) < width) & (row.view(np.uint32) < height)
+            few_seen = (x.ravel() if ok.all() else x[ok] for x in (place, key))
+            np.minimum.at(buffer, *few_seen)
+
+    ends = [0, *(np.flatnonzero(np.diff(samples, append=-1)) + 1)]
+    # in one thread: np.minimum.at lets no other run
+    for first, last in itertools.pairwise(ends):
+        step = max(1, 2**15 // int(samples[first]))  # what stays in cache
+        for k in range(first, last, step):
+            sample(slice(k, min(k + step, last)))
+
+
+def in_threads(work: Callable[[S], T], parts: Sequence[S]) -> list[T]:
+    """What `work` returns for each part. NumPy computes in several threads at a time."""
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        return list(pool.map(work, parts))

@@ -51,6 +51,17 @@ class Recording:
         """Bonded fractions, shape (frames, strands, points - 2, 4)."""
         return self.observed["fractions"]
 
+    def fractions_at_points(self) -> np.ndarray:
+        """Bonded fractions at all points, shape (frames, strands, points, 4): ends have their
+        neighbours', and a strand without inner points, which has no bonds, has 1."""
+        fractions = np.asarray(self.fractions)
+        inner, counts = fractions.shape[2], np.asarray(self.scene.strands.counts)
+        if inner == 0:
+            return np.ones_like(fractions, shape=(*fractions.shape[:2], 2, fractions.shape[3]))
+        place = np.clip(np.arange(inner + 2) - 1, 0, np.maximum(counts - 3, 0)[:, None])
+        found = np.take_along_axis(fractions, place[None, :, :, None], 2)
+        return np.where((counts > 2)[:, None, None], found, np.ones((), found.dtype))
+
     def end_of(self, phase: str) -> int:
         """Place of a phase's last frame. Raises ValueError if no frame is of that phase."""
         check.choice("phase", phase, tuple(dict.fromkeys(self.phases)))

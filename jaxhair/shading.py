@@ -19,6 +19,10 @@ BACKGROUND = np.array([[0.80, 0.82, 0.84], [0.55, 0.56, 0.57]], np.float32)  # t
 BONDED_COLORS = np.array([[0.03, 0.10, 0.85], [0.85, 0.04, 0.03]], np.float32)  # at 0, at 1
 
 
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.einsum("...i,...i->...", a, b))  # several times as fast as np.sum
+
+
 def kajiya_kay(tangent: Array, to_light: Array, to_eye: Array, power: float) -> tuple[Array, Array]:
     """Light scattered by a thin fibre, after Kajiya and Kay (1989).
 
@@ -26,8 +30,8 @@ def kajiya_kay(tangent: Array, to_light: Array, to_eye: Array, power: float) -> 
     which a cylinder reflects, cos(a) = sin(t, l) sin(t, e) - (t.l)(t.e), where l and e both
     point away from the fibre. All three arguments are unit vectors of shape (..., 3).
     """
-    along_light = np.sum(tangent * to_light, -1)
-    along_eye = np.sum(tangent * to_eye, -1)
+    along_light = _dot(tangent, to_light)
+    along_eye = _dot(tangent, to_eye)
     diffuse = np.sqrt(np.clip(1 - along_light**2, 0, 1))
     sin_eye = np.sqrt(np.clip(1 - along_eye**2, 0, 1))
     cone = np.clip(diffuse * sin_eye - along_light * along_eye, 0, 1)
@@ -97,19 +101,24 @@ class Shadows:
     ) -> None:
         """points [m], shape (n, 3), each stands for a hair of `lengths` [m] and `width` [m]."""
         self.light = light
-        places = light.project(points)
+        parts = np.split(points, range(2**16, len(points), 2**16))
+        places = np.concatenate(raster.in_threads(light.project, parts))
         depth = places[:, 2]
         self.front = float(depth.min())
         self.layer = max(float(depth.max()) - self.front, 1e-6) / (self.LAYERS - 3)
         cells = (light.size[1] // self.CELL, light.size[0] // self.CELL, self.LAYERS)
-        column, row, layer = (
-            np.clip(np.round(p).astype(np.int64), 0, n - 1)
-            for p, n in zip(self._cells(places), (cells[1], cells[0], cells[2]), strict=True)
-        )
+
+        def cell(places: Array) -> Array:
+            column, row, layer = (
+                np.clip(np.round(p).astype(np.int64), 0, n - 1)
+                for p, n in zip(self._cells(places), (cells[1], cells[0], cells[2]), strict=True)
+            )
+            return np.asarray((row * cells[1] + column) * cells[2] + layer)
+
+        parts = np.split(places, range(2**16, len(places), 2**16))
+        index = np.concatenate(raster.in_threads(cell, parts))
         area = (float(depth.min() + depth.max()) / 2 / light.focal * self.CELL) ** 2
-        cloud = np.bincount(
-            (row * cells[1] + column) * cells[2] + layer, lengths * width / area, np.prod(cells)
-        )
+        cloud = np.bincount(index, lengths * width / area, np.prod(cells))
         cloud = _blur(cloud.reshape(cells))
         self.cloud = (np.cumsum(cloud, -1) - cloud).astype(np.float32)
         self.total = np.ascontiguousarray(cloud.sum(-1).astype(np.float32))
@@ -207,7 +216,7 @@ class Surfaces:
 
 def unit(vectors: Array) -> Array:
     """`vectors` of shape (..., 3) scaled to length 1; zero stays zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = np.sqrt(_dot(vectors, vectors))[..., None]
     scaled: Array = vectors / np.maximum(length, length.dtype.type(1e-30))
     return scaled
 
@@ -240,7 +249,8 @@ def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
         camera.focal * SUPERSAMPLING,
         (camera.size[0] * SUPERSAMPLING, camera.size[1] * SUPERSAMPLING),
     )
-    edges = np.linalg.norm(np.diff(hairs.points, axis=1), axis=-1) * hairs.drawn
+    edges = np.diff(hairs.points, axis=1)
+    edges = np.sqrt(_dot(edges, edges)) * hairs.drawn
     lengths = np.pad(edges, ((0, 0), (0, 1))) / 2 + np.pad(edges, ((0, 0), (1, 0))) / 2
     vertices = hairs.points.reshape(-1, 3)
     shadows = Shadows(light, vertices, lengths.ravel(), hairs.width, surfaces.corners)
@@ -253,33 +263,46 @@ def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
     else:
         buffer = raster.empty_buffer(fine)
 
-    places = fine.project(hairs.points)
+    parts = np.array_split(hairs.points, 8)
+    places = np.concatenate(raster.in_threads(fine.project, parts))
     starts, ends = places[:, :-1][hairs.drawn], places[:, 1:][hairs.drawn]
     raster.lines(fine, starts, ends, buffer, bias=0.01 * radius, thickness=hairs.thickness)
-    colors = _lit_hairs(camera, light, hairs, shadows)
     names = (buffer & np.uint64(raster.NOTHING)).astype(np.int64)
     seen = np.flatnonzero(names != raster.NOTHING)
     line, along = np.divmod(names[seen], 64)
     mix = (along / np.float32(63))[:, None].astype(np.float32)
-    first, last = colors[:, :-1][hairs.drawn], colors[:, 1:][hairs.drawn]
-    image[seen] = first[line] * (1 - mix) + last[line] * mix
+    # most hairs are behind others: only what is seen is lit
+    last = np.flatnonzero(np.pad(hairs.drawn, ((0, 0), (1, 0))))[line]
+    lit = np.zeros(len(vertices), bool)
+    lit[last - 1] = lit[last] = True
+    row = np.cumsum(lit) - 1
+    colors = _lit(camera, light, hairs, np.flatnonzero(lit), shadows)
+    image[seen] = colors[row[last - 1]] * (1 - mix) + colors[row[last]] * mix
 
     n = SUPERSAMPLING
-    coarse: Array = image.reshape(camera.size[1], n, camera.size[0], n, 3).mean((1, 3))
-    return coarse
+    grid = image.reshape(camera.size[1], n, camera.size[0], n, 3)
+    coarse = np.zeros_like(grid[:, 0, :, 0])
+    for i, j in np.ndindex(n, n):
+        coarse += grid[:, i, :, j]
+    return coarse / np.float32(n * n)
 
 
-def _lit_hairs(camera: Camera, light: Camera, hairs: Hairs, shadows: Shadows) -> Array:
-    """Colours of the vertices as seen, shape (hairs, vertices, 3)."""
-    to_eye = unit(camera.position.astype(np.float32) - hairs.points)
-    lit = shadows.light_at(hairs.points.reshape(-1, 3), on_hair=True)
-    lit = lit.reshape(hairs.points.shape[:2])
-    diffuse, glint = kajiya_kay(hairs.tangents, -light.axes[2].astype(np.float32), to_eye, 40.0)
-    # Light from behind the camera, so that no side of a lock is black.
-    fill, _ = kajiya_kay(hairs.tangents, -camera.axes[2].astype(np.float32), to_eye, 1.0)
-    body = 0.10 + 0.22 * fill * (0.35 + 0.65 * lit) + 0.95 * diffuse * lit
-    color: Array = hairs.colors * body[..., None] + (hairs.gloss * glint * lit)[..., None]
-    return color
+def _lit(camera: Camera, light: Camera, hairs: Hairs, which: Array, shadows: Shadows) -> Array:
+    """Colours of some of all vertices as seen, shape (vertices, 3)."""
+
+    def part(few: Array) -> Array:
+        points, tangents = (x.reshape(-1, 3)[few] for x in (hairs.points, hairs.tangents))
+        to_eye = unit(camera.position.astype(np.float32) - points)
+        lit = shadows.light_at(points, on_hair=True)
+        diffuse, glint = kajiya_kay(tangents, -light.axes[2].astype(np.float32), to_eye, 40.0)
+        # Light from behind the camera, so that no side of a lock is black.
+        fill, _ = kajiya_kay(tangents, -camera.axes[2].astype(np.float32), to_eye, 1.0)
+        body = 0.10 + 0.22 * fill * (0.35 + 0.65 * lit) + 0.95 * diffuse * lit
+        own = hairs.colors.reshape(-1, 3)[few]
+        return np.asarray(own * body[:, None] + (hairs.gloss * glint * lit)[:, None])
+
+    parts = np.split(which, range(2**15, len(which), 2**15))
+    return np.concatenate(raster.in_threads(part, parts))
 
 
 def _paint_surfaces(

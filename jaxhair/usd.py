@@ -72,7 +72,7 @@ def write(
     counts = np.asarray(recording.scene.strands.counts)
     check_unit(unit, up)
     codes, rate = time_codes(np.asarray(recording.times, float))
-    bonded = _at_points(np.asarray(recording.fractions), counts)
+    bonded = recording.fractions_at_points().astype(np.float32)
     colors = np.broadcast_to(shading.linear(np.asarray(color)), (1, 3))
     if color_by is not None:
         colors = shading.bonded_color(bonded[..., BONDS.index(color_by)])
@@ -247,17 +247,6 @@ def _set_extents(
     hull = _inside(bezier_points(points, counts), 3 * counts - 2)
     box = np.stack([hull.min(1) - width / 2, hull.max(1) + width / 2], 1).astype(np.float32)
     samples(curves.CreateExtentAttr(), [vt.Vec3fArray.FromNumpy(b) for b in box], codes)
-
-
-def _at_points(fractions: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Fractions at all points, (frames, strands, points, 4): ends have their neighbours', and a
-    strand without inner points, which has no bonds, has 1."""
-    frames, strands, inner, kinds = fractions.shape
-    if inner == 0:
-        return np.ones((frames, strands, 2, kinds), np.float32)
-    place = np.clip(np.arange(inner + 2) - 1, 0, np.maximum(counts - 3, 0)[:, None])
-    found = np.take_along_axis(fractions, place[None, :, :, None], 2)
-    return np.where((counts > 2)[:, None, None], found, 1.0).astype(np.float32)
 
 
 def _set_primvars(

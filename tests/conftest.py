@@ -24,6 +24,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Refuses versions of pytest and xdist that ignore groups: all takes twice as long then."""
+    in_groups = session.config.getoption("dist", None) == "loadgroup"
+    if in_groups and "PYTEST_XDIST_WORKER" in os.environ:
+        alone = [item.nodeid for item in session.items if "@" not in item.nodeid]
+        if alone:
+            raise pytest.UsageError(f"--dist loadgroup left {alone[0]} in no group")
+
+
 def pytest_runtest_teardown() -> None:
     """Forgets compiled programs when there are many: a process may have 65,530 pieces of memory
     mapped, each program has hundreds, and one too many kills the process."""
