@@ -190,9 +190,12 @@ def lines(
         x, y, w = (origin[k, few] + along * change[k, few] for k in range(3))
         key = _key(w, kept[few] * 64 + (along * 63).astype(np.int64))
         for shift in shifts:
-            column = np.floor(x + shift * steep[few]).astype(np.int32)
-            row = np.floor(y + shift * (1 - steep[few])).astype(np.int32)
-            place = row.astype(np.int64) * width + column
+            column, row = x, y
+            if shift:
+                column = np.floor(x + shift * steep[few])
+                row = np.floor(y + shift * (1 - steep[few]))
+            column, row = column.astype(np.int32), row.astype(np.int32)
+            place = row * np.int32(width) + column
             ok = (column.view(np.uint32) < width) & (row.view(np.uint32) < height)
             few_seen = (x.ravel() if ok.all() else x[ok] for x in (place, key))
             np.minimum.at(buffer, *few_seen)
