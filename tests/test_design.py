@@ -47,6 +47,7 @@ def test_how_the_rod_changes_with_the_hair() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_curl_with_a_number_of_waves() -> None:
     """1.5 turns of 30 mm in 20 cm of hair rise by sqrt((L / 1.5)^2 - (pi D)^2) each."""
     found = fitting.design(fitting.Wish(30e-3, waves=1.5, after_wash=True), verify=False)

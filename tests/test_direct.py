@@ -333,7 +333,9 @@ def test_vmap_over_whole_scenes() -> None:
         np.testing.assert_allclose(together[i], end(moduli[i]), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", jh.scenes.SCENES)
+@pytest.mark.parametrize(
+    "name", ["bed-hair", "perm", pytest.param("blow-dry", marks=pytest.mark.slow)]
+)
 def test_the_papers_scenes_with_the_direct_solver(name: str) -> None:
     """Contact, obstacles, wind and winding, real hair's stiffness, float32: hair stays hair."""
     scene = jh.scenes.by_name(name, strands=8, solver=jh.Direct())

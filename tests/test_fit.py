@@ -52,8 +52,10 @@ def observed(influence: np.ndarray, rate: float, seed: int) -> dict[str, fitting
 
 @pytest.mark.parametrize(
     ("influence", "rate"),
-    [((0.33, 0.30, 0.20, 0.17), 0.33), ((0.15, 0.45, 0.10, 0.30), 0.8)],
-    ids=["table 1", "other hair"],
+    [
+        pytest.param((0.33, 0.30, 0.20, 0.17), 0.33, id="table 1"),
+        pytest.param((0.15, 0.45, 0.10, 0.30), 0.8, id="other hair", marks=pytest.mark.slow),
+    ],
 )
 def test_four_states_determine_every_influence_and_the_peeling_rate(
     influence: tuple[float, ...], rate: float
