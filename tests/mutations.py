@@ -259,7 +259,7 @@ MUTATIONS = (
         "no direction between hairs as near as rounding",
         "jnp.where(nowhere, 0, apart)",
         "apart",
-        hard("hairs_that_coincide", solver="direct"),
+        (*CONTACT, "-k", "but_for_rounding"),
     ),
     Mutation(
         "jaxhair/contact.py",

@@ -200,6 +200,20 @@ def test_hairs_that_coincide(dtype: str) -> None:
     assert np.isfinite(jax.jit(jax.grad(total))(state.positions)).all()
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_hairs_that_coincide_but_for_rounding(dtype: str) -> None:
+    """A difference of a last digit is no direction: no push, where a hundredth of the radius
+    apart there is nearly the greatest."""
+    one = np.asarray(hair(1, 5, dtype=dtype).positions)[0]
+    for apart, pushed in ((np.nextafter(one, one + 1) - one, False), (2e-5 + 0 * one, True)):
+        strands = jh.Strands.from_points(np.stack([one, (one + apart).astype(dtype)]))
+        setup, state, _ = prepared(strands, jh.HairContact(2e-3, 20.0))
+        ours, theirs = both(setup, state)
+        most = 20.0 * DT
+        assert (float(jnp.abs(ours).max()) > 0.5 * most) == pushed
+        np.testing.assert_allclose(ours, theirs, atol=1e-3 * most)
+
+
 def test_derivatives() -> None:
     """Of the pushes themselves: forward as reverse mode, and as central differences."""
     setup, state, contact = prepared(hair(30, 5), jh.HairContact(3e-3, 20.0, capacity=64))
