@@ -159,53 +159,56 @@ def triangles(camera: Camera, corners: Array, near: float) -> Array:
 
 
 def lines(
-    camera: Camera, start: Array, end: Array, buffer: Array, *, bias: float, thickness: int
+    camera: Camera, places: Array, drawn: Array, buffer: Array, *, bias: float, thickness: int
 ) -> None:
-    """Draw lines, `thickness` pixels across, into `buffer` in place.
+    """Draw lines from one vertex to the next, `thickness` pixels across, into `buffer` in place.
 
-    start, end: homogeneous places of the ends, shape (n, 3). What is seen is named by 64 i + k
-    for line i at the fraction k / 63 of its length.
+    places: homogeneous places of vertices, shape (n, 3). drawn: whether there is a line from a
+    vertex to the next, shape (n,). What is seen is named by 64 i + k for the line from vertex i at
+    the fraction k / 63 of its length.
     bias: [m] by which a line is drawn nearer than it is.
     """
     width, height = camera.size
-    near = max(bias, 1e-6) * 2
-    kept = np.flatnonzero((start[:, 2] > near) & (end[:, 2] > near))
-    a = start[kept, :2] / start[kept, 2:]
-    b = end[kept, :2] / end[kept, 2:]
-    limit = np.array([width, height], np.float32)
-    onscreen = np.all((np.maximum(a, b) >= 0) & (np.minimum(a, b) < limit), -1)
-    kept, a, b = kept[onscreen], a[onscreen], b[onscreen]
-    samples = np.ceil(np.max(np.abs(b - a), -1)).astype(np.int64).clip(1, 4 * max(width, height))
+    w = np.ascontiguousarray(places[:, 2])
+    ahead = w > max(bias, 1e-6) * 2
+    x, y = (places[:, k] / np.where(ahead, w, 1) for k in (0, 1))
+    onscreen = drawn[:-1] & ahead[:-1] & ahead[1:]
+    for place, most in ((x, width), (y, height)):
+        onscreen &= np.maximum(place[:-1], place[1:]) >= 0
+        onscreen &= np.minimum(place[:-1], place[1:]) < most
+    kept = np.flatnonzero(onscreen)
+    longer = np.maximum(np.abs(np.diff(x)), np.abs(np.diff(y)))[kept]
     # Lines of as many samples come together, and then samples lie lines last: loops are long.
+    samples = np.ceil(longer).clip(1, min(4 * max(width, height), 65535)).astype(np.uint16)
     order = np.argsort(samples, kind="stable")
-    kept, a, b, samples = kept[order], a[order], b[order], samples[order]
-    origin = np.stack([*a.T, start[kept, 2] - np.float32(bias)])
-    change = np.stack([*(b - a).T, end[kept, 2] - start[kept, 2]])
-    steep = (np.abs(change[1]) > np.abs(change[0])).astype(np.float32)
+    kept, samples = kept[order], samples[order].astype(np.int64)
     shifts = np.arange(thickness, dtype=np.float32) - np.float32((thickness - 1) / 2)
 
     def sample(few: slice) -> None:
-        n = samples[few.start]
+        n, first = samples[few.start], kept[few]
         along = ((np.arange(n) + np.float32(0.5)) / np.float32(n)).astype(np.float32)[:, None]
-        x, y, w = (origin[k, few] + along * change[k, few] for k in range(3))
-        key = _key(w, kept[few] * 64 + (along * 63).astype(np.int64))
+        (px, dx), (py, dy), (pw, dw) = ((p[first], p[first + 1] - p[first]) for p in (x, y, w))
+        across, down = px + along * dx, py + along * dy
+        key = _key(pw - np.float32(bias) + along * dw, first * 64 + (along * 63).astype(np.int64))
+        steep = (np.abs(dy) > np.abs(dx)).astype(np.float32)
         for shift in shifts:
-            column, row = x, y
+            at, line = across, down
             if shift:
-                column = np.floor(x + shift * steep[few])
-                row = np.floor(y + shift * (1 - steep[few]))
-            column, row = column.astype(np.int32), row.astype(np.int32)
+                at, line = np.floor(at + shift * steep), np.floor(line + shift * (1 - steep))
+            column, row = at.astype(np.int32), line.astype(np.int32)
             place = row * np.int32(width) + column
             ok = (column.view(np.uint32) < width) & (row.view(np.uint32) < height)
-            few_seen = (x.ravel() if ok.all() else x[ok] for x in (place, key))
-            np.minimum.at(buffer, *few_seen)
+            if ok.all():
+                np.minimum.at(buffer, place.ravel(), key.ravel())
+            else:
+                np.minimum.at(buffer, place[ok], key[ok])
 
-    ends = [0, *(np.flatnonzero(np.diff(samples, append=-1)) + 1)]
     # in one thread: np.minimum.at lets no other run
-    for first, last in itertools.pairwise(ends):
-        step = max(1, 2**15 // int(samples[first]))  # what stays in cache
-        for k in range(first, last, step):
-            sample(slice(k, min(k + step, last)))
+    ends = [0, *(np.flatnonzero(np.diff(samples, append=-1)) + 1)]
+    for begin, end in itertools.pairwise(ends):
+        step = max(1, 2**15 // int(samples[begin]))  # what stays in cache
+        for k in range(begin, end, step):
+            sample(slice(k, min(k + step, end)))
 
 
 def in_threads(work: Callable[[S], T], parts: Sequence[S]) -> list[T]:

@@ -101,8 +101,7 @@ class Shadows:
     ) -> None:
         """points [m], shape (n, 3), each stands for a hair of `lengths` [m] and `width` [m]."""
         self.light = light
-        parts = np.split(points, range(2**16, len(points), 2**16))
-        places = np.concatenate(raster.in_threads(light.project, parts))
+        places = light.project(points)
         depth = places[:, 2]
         self.front = float(depth.min())
         self.layer = max(float(depth.max()) - self.front, 1e-6) / (self.LAYERS - 3)
@@ -263,21 +262,19 @@ def render(stage: Stage, hairs: Hairs, surfaces: Surfaces) -> Array:
     else:
         buffer = raster.empty_buffer(fine)
 
-    parts = np.array_split(hairs.points, 8)
-    places = np.concatenate(raster.in_threads(fine.project, parts))
-    starts, ends = places[:, :-1][hairs.drawn], places[:, 1:][hairs.drawn]
-    raster.lines(fine, starts, ends, buffer, bias=0.01 * radius, thickness=hairs.thickness)
+    places = fine.project(vertices)
+    drawn = np.pad(hairs.drawn, ((0, 0), (0, 1))).ravel()
+    raster.lines(fine, places, drawn, buffer, bias=0.01 * radius, thickness=hairs.thickness)
     names = (buffer & np.uint64(raster.NOTHING)).astype(np.int64)
     seen = np.flatnonzero(names != raster.NOTHING)
-    line, along = np.divmod(names[seen], 64)
+    first, along = np.divmod(names[seen], 64)
     mix = (along / np.float32(63))[:, None].astype(np.float32)
     # most hairs are behind others: only what is seen is lit
-    last = np.flatnonzero(np.pad(hairs.drawn, ((0, 0), (1, 0))))[line]
     lit = np.zeros(len(vertices), bool)
-    lit[last - 1] = lit[last] = True
+    lit[first] = lit[first + 1] = True
     row = np.cumsum(lit) - 1
     colors = _lit(camera, light, hairs, np.flatnonzero(lit), shadows)
-    image[seen] = colors[row[last - 1]] * (1 - mix) + colors[row[last]] * mix
+    image[seen] = colors[row[first]] * (1 - mix) + colors[row[first + 1]] * mix
 
     n = SUPERSAMPLING
     grid = image.reshape(camera.size[1], n, camera.size[0], n, 3)
