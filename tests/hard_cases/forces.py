@@ -164,7 +164,14 @@ def root_spins_at_200_turns_a_second(s: Setting) -> jh.Scene:
     smooth="forces that would break hair jump with a micrometre",
     speed=200,
     stretch=1.2,
-    except_for={"direct": SHORTENED},
+    except_for={
+        "direct": SHORTENED,
+        "direct-float32": {
+            "slopes": 2,
+            "modes": 1e-4,
+            "why": "derivatives are 1e8 after 2 steps and 4 after 8, where all digits are rounding",
+        },
+    },
 )
 def pulled_to_one_and_a_half_lengths(s: Setting) -> Start:
     scene = s.scene(straight(), *HANGING, jh.Hold("tip"))
