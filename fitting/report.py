@@ -52,7 +52,10 @@ def table(fit: "Fit") -> str:
         )
     if len(fit.basins) > 1:
         lines.append("Different starts led to different ends:")
-        lines += [f"  misfit {b.misfit:.4g} from {b.starts} starts" for b in fit.basins]
+        lines += [
+            f"  misfit {b.misfit:.4g} from {b.starts} start{'s' * (b.starts > 1)}"
+            for b in fit.basins
+        ]
     strong = [pair for pair in spread.strongest_correlations() if abs(pair[2]) > 0.9]
     if strong:
         lines.append("Numbers that the data hardly tell apart (correlation):")
