@@ -237,11 +237,9 @@ class _Scene:
         camera, added = self.stage.camera, self.interpolation
         points = self.frames[index].astype(np.float32)
         used = self.used[added.guide]
-        # One pixel of 800 where hairs are many, up to two where they are few.
-        pixels = min((2000 / len(added.guide)) ** 0.25, 2) * min(camera.size) / 800
         # Curves are cut into pieces of about five pixels, so that no corner shows; nobody looks
         # at one of very many hairs.
-        piece = 5 * max(1, min(camera.size) / 800 / pixels)
+        piece = 5 * max(1, (len(used) / 2000) ** 0.25)
         depth = max(float(np.min(camera.project(points)[..., 2])), 0.1 * self.stage.radius)
         longest = np.max(np.linalg.norm(np.diff(points, axis=1), axis=-1)) / depth * camera.focal
         pieces = int(np.clip(np.ceil(longest / piece), 1, 16))
@@ -261,6 +259,8 @@ class _Scene:
             place = np.arange(points.shape[1]) * pieces
             rows = [np.interp(steps, place, row) for row in self.bonded[index]]
             colors = shading.bonded_color(np.array(rows))[added.guide]
+        # One pixel of 800 where hairs are many, up to two where they are few.
+        pixels = min((2000 / len(used)) ** 0.25, 2) * min(camera.size) / 800
         thickness = max(1, round(shading.SUPERSAMPLING * pixels))
         pixel = np.linalg.norm(camera.position - self.stage.centre) / camera.focal
         return shading.Hairs(

@@ -194,8 +194,8 @@ def lines(
         for shift in shifts:
             at, line = across, down
             if shift:
-                at, line = np.floor(at + shift * steep), np.floor(line + shift * (1 - steep))
-            column, row = at.astype(np.int32), line.astype(np.int32)
+                at, line = at + shift * steep, line + shift * (1 - steep)
+            column, row = np.floor(at).astype(np.int32), np.floor(line).astype(np.int32)
             place = row * np.int32(width) + column
             ok = (column.view(np.uint32) < width) & (row.view(np.uint32) < height)
             if ok.all():
