@@ -16,8 +16,8 @@ from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.strands import State
 
-CHUNK = 2**15
-"""Pairs whose pushes are computed together: what fits into a processor's cache."""
+CHUNK, WIDE = 2**15, 2**20
+"""Pairs whose pushes are computed together: what fits into a CPU's cache, and on a GPU more."""
 FULL = 0.8
 """Share of the room in lists that a new skin is meant to fill."""
 LEAST = 1e-3
@@ -128,7 +128,7 @@ class HairContact(RememberingEffect):
         """Lists that hold nowhere."""
         points, _, strands = state.positions.shape
         room = points * strands * min(self.capacity, (points - 1) * max(strands - 1, 1))
-        chunks = -(-room // CHUNK)
+        chunks = -(-room // (CHUNK if jax.default_backend() == "cpu" else WIDE))
         none = jnp.full((chunks, -(-room // chunks)), points * strands, jnp.int32)
         x = lax.stop_gradient(state.positions)
         return Lists(

@@ -7,15 +7,32 @@ block, lie close together, and so do the edges that start at them. Boxes around 
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 BLOCK = 32
 """Points in a block, and blocks in a group: the bits of a word, one for each edge of a block."""
-TILES = 64
-"""Pairs of blocks whose distances are computed together."""
-ROOM = 512
-"""Pairs of a point and an edge that are listed together."""
+
+
+class Batch(NamedTuple):
+    """What is worked on together.
+
+    groups: pairs of groups whose blocks are compared. blocks: pairs of blocks whose distances are
+    computed. pairs: pairs of a point and an edge that are listed.
+    """
+
+    groups: int
+    blocks: int
+    pairs: int
+
+
+IN_CACHE = Batch(1, 64, 512)
+"""For a CPU, where a batch should stay in cache."""
+WIDE = Batch(128, 2**13, 2**17)
+"""For a GPU, where a batch should fill the device: on an H200 the contact of 20,000 strands takes
+a hundredth of the time that it takes in batches for a CPU
+(`tests/benchmarks/accelerator.py contact`)."""
 
 
 class Pairs(NamedTuple):
@@ -31,7 +48,14 @@ class Pairs(NamedTuple):
     number: Array
 
 
-def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacity: int) -> Pairs:
+def near_pairs(
+    starts: Array,
+    ends: Array,
+    strands: Array,
+    reach: Array,
+    capacity: int,
+    batch: Batch | None = None,
+) -> Pairs:
     """The pairs of a point and an edge of another strand whose distance is less than `reach`.
 
     Arguments:
@@ -39,7 +63,9 @@ def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacit
         ends: of the edge that starts at each point [m], shape (3, points); NaN where there is none.
         strands: number of the strand of each point, shape (points,).
         reach: [m], shape ().
+        batch: what is worked on together; by default what suits JAX's device.
     """
+    batch = batch or (IN_CACHE if jax.default_backend() == "cpu" else WIDE)
     size = starts.shape[1]
     order = jnp.argsort(_along_the_curve(starts)).astype(jnp.int32)
     groups = -(-size // BLOCK**2)
@@ -57,32 +83,39 @@ def near_pairs(starts: Array, ends: Array, strands: Array, reach: Array, capacit
     square = jnp.sum(along**2, axis=0, keepdims=True)
     across = along / jnp.where(square == 0, 1, square)
     pairs_of_groups, many_groups = _listed(_near(_whole(of_points), _whole(of_edges), reach))
+    at_once = min(batch.groups, groups**2)
+    blocks_at_once = min(batch.blocks, at_once * BLOCK**2)
 
     def of_groups(number: Array, found: Pairs) -> Pairs:
-        """With the pairs of the points of one group and the edges of another."""
-        first, second = jnp.divmod(pairs_of_groups[number], groups)
-        near = _near(_of_group(of_points, first), _of_group(of_edges, second), reach)
+        """With the pairs of the points of one group and the edges of another, of some of them."""
+        numbers = jnp.asarray(number, jnp.int32) * at_once + jnp.arange(at_once, dtype=jnp.int32)
+        numbers = jnp.where(numbers < many_groups, numbers, groups**2)
+        pairs = pairs_of_groups.at[numbers].get(mode="fill", fill_value=groups**2)
+        first, second = jnp.divmod(pairs, groups)  # behind the last: no group
+        near = _near(_of_groups(of_points, first), _of_groups(of_edges, second), reach)
         tiles, many = _listed(near)
 
         def some(carry: tuple[Array, Pairs]) -> tuple[Array, Pairs]:
             done, found = carry
-            number = done + jnp.arange(TILES, dtype=done.dtype)
-            a, b = jnp.divmod(tiles[jnp.minimum(number, BLOCK**2 - 1)], BLOCK)
-            a, b = first * BLOCK + a, second * BLOCK + b
+            number = done + jnp.arange(blocks_at_once, dtype=done.dtype)
+            tile = tiles[jnp.minimum(number, len(tiles) - 1)]
+            pair, place = jnp.divmod(tile, BLOCK**2)
+            a, b = jnp.divmod(place, BLOCK)
+            a, b = first[pair] * BLOCK + a, second[pair] * BLOCK + b
             apart = p[:, a, None] - p[:, b, :, None]  # (3, tiles, edges, points)
             place = jnp.clip(jnp.sum(apart * across[:, b, :, None], axis=0, keepdims=True), 0, 1)
             square = jnp.sum((apart - place * along[:, b, :, None]) ** 2, axis=0)
             near = (square < reach**2) & (own[a, None] != own[b, :, None])
             words = _words(near)
             words = jnp.where((number < many)[:, None], words, 0)
-            return done + TILES, _with(found, words, a, b, order)
+            return done + blocks_at_once, _with(found, words, a, b, order, batch.pairs)
 
         start = jnp.zeros_like(many), found
         return lax.while_loop(lambda carry: carry[0] < many, some, start)[1]
 
-    none = jnp.full(capacity + ROOM, size, jnp.int32)
+    none = jnp.full(capacity + batch.pairs, size, jnp.int32)
     found = Pairs(none, none, jnp.zeros((), jnp.int32))
-    found = lax.fori_loop(0, many_groups, of_groups, found)
+    found = lax.fori_loop(0, -(-many_groups // at_once), of_groups, found)
     inside = jnp.arange(capacity, dtype=jnp.int32) < found.number
     points, edges = (jnp.where(inside, x[:capacity], size) for x in found[:2])
     return Pairs(points, edges, found.number)
@@ -143,16 +176,22 @@ def _whole(boxes: Box) -> Box:
     return low.min(axis=-1), high.max(axis=-1)
 
 
-def _of_group(boxes: Box, number: Array) -> Box:
-    low, high = (lax.dynamic_slice_in_dim(x, number * BLOCK, BLOCK, axis=1) for x in boxes)
-    return low, high
+def _of_groups(boxes: Box, groups: Array) -> Box:
+    """Boxes of blocks of some groups, shape (3, groups, BLOCK); empty ones where there is none."""
+    low, high = (x.reshape(3, -1, BLOCK) for x in boxes)
+    return (
+        low.at[:, groups].get(mode="fill", fill_value=jnp.inf),
+        high.at[:, groups].get(mode="fill", fill_value=-jnp.inf),
+    )
 
 
 def _near(a: Box, b: Box, reach: Array) -> Array:
-    """Whether boxes are nearer than `reach`, shape (boxes of a, boxes of b). Empty ones are not."""
+    """Whether boxes (3, ..., boxes) are nearer than `reach`, shape (..., boxes of a, boxes of b).
+    Empty ones are not."""
     (low_a, high_a), (low_b, high_b) = a, b
-    gap = jnp.maximum(low_b[:, None] - high_a[:, :, None], low_a[:, :, None] - high_b[:, None])
-    return jnp.sum(jnp.maximum(gap, 0) ** 2, axis=0) < reach**2
+    above = low_b[..., None, :] - high_a[..., None]
+    below = low_a[..., None] - high_b[..., None, :]
+    return jnp.sum(jnp.maximum(jnp.maximum(above, below), 0) ** 2, axis=0) < reach**2
 
 
 def _words(true: Array) -> Array:
@@ -161,16 +200,16 @@ def _words(true: Array) -> Array:
     return jnp.sum(jnp.where(true, bits[None, :, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
-def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array) -> Pairs:
+def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array, at_once: int) -> Pairs:
     """With the pairs that words of bits (tiles, BLOCK) name, of points in blocks a, edges in b."""
-    capacity = len(found.points) - ROOM
+    capacity = len(found.points) - at_once
     words = words.ravel()
     ends = jnp.cumsum(lax.population_count(words).astype(jnp.int32))
     many = ends[-1]
 
     def some(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         done, points, edges = carry
-        number = done + jnp.arange(ROOM, dtype=jnp.int32)
+        number = done + jnp.arange(at_once, dtype=jnp.int32)
         word = jnp.searchsorted(ends, number, side="right").astype(jnp.int32)
         word = jnp.minimum(word, len(words) - 1)
         before = ends[word] - lax.population_count(words[word]).astype(jnp.int32)
@@ -179,7 +218,7 @@ def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array) -> Pairs
         at = jnp.minimum(found.number + done, capacity)
         points = lax.dynamic_update_slice(points, order[a[tile] * BLOCK + point], (at,))
         edges = lax.dynamic_update_slice(edges, order[b[tile] * BLOCK + edge], (at,))
-        return done + ROOM, points, edges
+        return done + at_once, points, edges
 
     carry = jnp.zeros((), jnp.int32), found.points, found.edges
     _, points, edges = lax.while_loop(lambda carry: carry[0] < many, some, carry)

@@ -12,7 +12,7 @@ import pytest
 from jax import lax
 
 import jaxhair as jh
-from jaxhair.neighbours import _along_the_curve, near_pairs
+from jaxhair.neighbours import IN_CACHE, WIDE, Batch, _along_the_curve, near_pairs
 from jaxhair.simulate import Setup, advance, blank, prepare, remembering_step, start
 
 # Relative to the largest push. Float32 rounds the direction between hairs that nearly coincide.
@@ -93,8 +93,12 @@ def test_many_strands() -> None:
     assert_same(*both(setup, replace(state, positions=state.positions + spread)))
 
 
-@pytest.mark.parametrize("reach", [0.0, 1e-3, 1e-2, 1.0])
-def test_pairs_are_those_of_a_search_by_brute_force(reach: float) -> None:
+@pytest.mark.parametrize(
+    ("reach", "batch"),
+    [(0.0, IN_CACHE), (1e-3, IN_CACHE), (1e-2, IN_CACHE), (1.0, IN_CACHE)]
+    + [(1e-2, WIDE), (1e-3, Batch(3, 7, 50)), (1e-2, Batch(4, 100, 1000))],
+)
+def test_pairs_are_those_of_a_search_by_brute_force(reach: float, batch: Batch) -> None:
     """Each once, and none too many; also with points and edges that are missing."""
     rng = np.random.default_rng(3)
     starts = rng.uniform(0, 0.1, (3, 1500))
@@ -106,9 +110,8 @@ def test_pairs_are_those_of_a_search_by_brute_force(reach: float) -> None:
     near = np.linalg.norm(p - a - place[..., None] * along, axis=-1) < reach
     near &= strands[:, None] != strands
     room = max(int(near.sum()), 1)
-    found = near_pairs(
-        jnp.asarray(starts), jnp.asarray(ends), jnp.asarray(strands), jnp.asarray(reach), room
-    )
+    given = (jnp.asarray(x) for x in (starts, ends, strands, reach))
+    found = near_pairs(*given, room, batch)
     assert int(found.number) == near.sum()
     places = np.stack([found.points, found.edges])[:, : near.sum()]
     np.testing.assert_array_equal(np.unique(places, axis=1), np.argwhere(near).T)
