@@ -374,7 +374,9 @@ def killed_and_finished(tmp_path: Path, what: str, kills: int, seed: int) -> Non
     assert not list(folder.glob(".*"))  # nothing is left of what was killed
 
 
-@pytest.mark.parametrize("what", ["simulation", "fit", "fit each"])
+@pytest.mark.parametrize(
+    "what", ["simulation", "fit", pytest.param("fit each", marks=pytest.mark.slow)]
+)
 def test_killed_twice(tmp_path: Path, what: str) -> None:
     killed_and_finished(tmp_path, what, 2, seed=1)
 

@@ -184,7 +184,7 @@ def test_lists_that_are_full_have_a_smaller_skin() -> None:
     assert 0 <= skins[0] < skins[1]
 
 
-@pytest.mark.parametrize("dtype", AGREES)
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_hairs_that_coincide(dtype: str) -> None:
     """They push each other nowhere, others as ever, and slopes are finite."""
     strands = hair(12, 5, dtype=dtype)
@@ -203,7 +203,7 @@ def test_hairs_that_coincide(dtype: str) -> None:
     assert np.isfinite(jax.jit(jax.grad(total))(state.positions)).all()
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_hairs_that_coincide_but_for_rounding(dtype: str) -> None:
     """A difference of a last digit is no direction: no push, where a hundredth of the radius
     apart there is nearly the greatest."""
@@ -255,6 +255,7 @@ def test_a_run_does_not_depend_on_how_its_steps_are_split() -> None:
     np.testing.assert_allclose(by_one.positions, whole, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_over_scenes_at_once() -> None:
     """`jax.vmap` over runs, and derivatives of all of them."""
     strands = hair(8, 5)

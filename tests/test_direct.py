@@ -193,7 +193,7 @@ NUMBERS: dict[str, Any] = {
     [
         jh.Direct(),
         pytest.param(jh.Direct(newton_steps=2, substeps=2), marks=pytest.mark.slow),
-        jh.Compliant(iterations=3),
+        pytest.param(jh.Compliant(iterations=3), marks=pytest.mark.slow),
     ],
 )
 def test_gradients_agree_with_central_differences_and_between_modes(solver: Any) -> None:
@@ -334,7 +334,8 @@ def test_vmap_over_whole_scenes() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["bed-hair", "perm", pytest.param("blow-dry", marks=pytest.mark.slow)]
+    "name",
+    ["perm", *(pytest.param(x, marks=pytest.mark.slow) for x in ("bed-hair", "blow-dry"))],
 )
 def test_the_papers_scenes_with_the_direct_solver(name: str) -> None:
     """Contact, obstacles, wind and winding, real hair's stiffness, float32: hair stays hair."""

@@ -88,7 +88,7 @@ def test_one_state_leaves_combinations_undetermined_and_names_them() -> None:
     assert "do not determine" in str(found)
 
 
-@pytest.mark.parametrize("method", ["adam", "l-bfgs"])
+@pytest.mark.parametrize("method", ["adam", pytest.param("l-bfgs", marks=pytest.mark.slow)])
 def test_gradient_methods_find_the_same_curl(method: str) -> None:
     """The set of a water set is the hydrogen influence."""
     options: dict[str, Any] = {"rod_diameter": 30e-3, "seconds": 0.05, "free": (jh.Hold(),)}

@@ -86,7 +86,10 @@ def central(f: Callable[[dict[str, Any]], Any], name: str, step: float) -> np.nd
     return slopes
 
 
-@pytest.mark.parametrize("contact", [False, True], ids=["free", "contact"])
+@pytest.mark.parametrize(
+    "contact",
+    [pytest.param(False, id="free", marks=pytest.mark.slow), pytest.param(True, id="contact")],
+)
 def test_gradients_agree_with_central_differences_and_between_modes(contact: bool) -> None:
     f = partial(tip, contact=contact)
     reverse = jax.jit(jax.grad(lambda n: tip(n, contact)))(as_arrays())

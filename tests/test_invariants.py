@@ -25,7 +25,8 @@ from jaxhair.strands import State, Strands
 
 TOLERANCE = {"float64": 1e-11, "float32": 3e-5}  # positions [m], after 20 steps
 ROUNDING = {"float64": 1e-15, "float32": 3e-7}
-DTYPES = pytest.mark.parametrize("dtype", TOLERANCE)
+SLOW = pytest.mark.slow
+DTYPES = pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=SLOW)])
 SOLVERS: dict[str, Any] = {
     "paper": PositionBased(iterations=3),
     "sequential": PositionBased(iterations=3, sweep="sequential"),
@@ -33,6 +34,9 @@ SOLVERS: dict[str, Any] = {
     "direct": Direct(),
 }
 EACH = pytest.mark.parametrize("solver", SOLVERS)
+TWO = pytest.mark.parametrize(  # the others in the slow run
+    "solver", [s if s in ("paper", "direct") else pytest.param(s, marks=SLOW) for s in SOLVERS]
+)
 STEPS, DT = 20, 1 / 360
 
 
@@ -215,14 +219,14 @@ def test_frames_stay_unit(dtype: str, solver: str) -> None:
     np.testing.assert_allclose(norm, 1, rtol=0, atol=ROUNDING[dtype])
 
 
-@EACH
+@TWO
 def test_float32_is_close_to_float64(solver: str) -> None:
     end = final(scene_of_3("float32", solver))
     assert_same(final(scene_of_3("float64", solver)), end, TOLERANCE["float32"])
     assert end.positions.dtype == "float32"
 
 
-@EACH
+@TWO
 def test_a_strand_far_away(solver: str) -> None:
     """A fourth strand, out of reach of all others, changes nothing of theirs."""
     scene = scene_of_3("float64", solver)

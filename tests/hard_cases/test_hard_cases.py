@@ -25,35 +25,52 @@ SHAPE = 1 + 1e-4  # of remembered shapes' norms
 assert {contact, forces, geometry, materials}  # imported for the cases that they list
 
 
-def settings(now: tuple[str, ...], later: tuple[str, ...], in_turn: bool = False) -> list[object]:
+def kinds() -> dict[str, int]:
+    """A number for each case: the same for cases that share a compiled program."""
+    setting, seen, found = Setting("direct", "float64"), [], {}
+    for name, case in CASES.items():
+        leaves, structure = jax.tree.flatten(running.arrays(case.start(setting)))
+        kind = structure, [np.shape(x) for x in leaves], case.within(setting).slopes
+        if kind not in seen:
+            seen.append(kind)
+        found[name] = seen.index(kind)
+    return found
+
+
+KINDS = kinds()
+
+
+def settings(*turns: tuple[str, ...], later: tuple[str, ...] = ()) -> list[object]:
     """All cases for each "solver-precision", each of these in a process.
 
     Arguments:
-        later: only in the slow run. in_turn: outside of it each case has one of `now`, and the
-            next case the next one.
+        turns: each kind of case has one of these sets of settings, and the next kind the next one;
+            the others in the slow run. later: only in the slow run, for all.
     """
 
-    def marks(setting: str, place: int) -> list[pytest.MarkDecorator]:
-        slow = setting in later or (in_turn and setting != now[place % len(now)])
+    def marks(setting: str, name: str) -> list[pytest.MarkDecorator]:
+        slow = setting not in turns[KINDS[name] % len(turns)]
         return [pytest.mark.xdist_group(setting), *([pytest.mark.slow] if slow else [])]
 
+    each = dict.fromkeys(setting for turn in (*turns, later) for setting in turn)
     return [
         pytest.param(
             name,
             Setting(*setting.split("-")),
             id=f"{setting}-{name}",
-            marks=marks(setting, place),
+            marks=marks(setting, name),
         )
-        for setting in (*now, *later)
-        for place, name in enumerate(CASES)
+        for setting in each
+        for name in CASES
     ]
 
 
 @pytest.mark.parametrize(
     ("name", "setting"),
     settings(
-        tuple(f"{solver}-float32" for solver in SOLVERS),
-        tuple(f"{solver}-float64" for solver in SOLVERS),
+        ("direct-float32", "sequential-float32"),
+        ("paper-float32", "compliant-float32"),
+        later=tuple(f"{solver}-float64" for solver in SOLVERS),
     ),
 )
 def test_values(name: str, setting: Setting) -> None:
@@ -76,9 +93,9 @@ def test_values(name: str, setting: Setting) -> None:
 @pytest.mark.parametrize(
     ("name", "setting"),
     settings(
-        ("direct-float64", "paper-float64"),
-        ("compliant-float64", "direct-float32", "paper-float32", "compliant-float32"),
-        in_turn=True,
+        ("paper-float64",),
+        ("direct-float64",),
+        later=("compliant-float64", "direct-float32", "paper-float32", "compliant-float32"),
     ),
 )
 def test_derivatives(name: str, setting: Setting) -> None:
