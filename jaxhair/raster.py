@@ -173,9 +173,10 @@ def lines(
     ahead = w > max(bias, 1e-6) * 2
     x, y = (places[:, k] / np.where(ahead, w, 1) for k in (0, 1))
     onscreen = drawn[:-1] & ahead[:-1] & ahead[1:]
+    beside = (thickness - 1) / 2  # pixels that a line reaches beyond itself
     for place, most in ((x, width), (y, height)):
-        onscreen &= np.maximum(place[:-1], place[1:]) >= 0
-        onscreen &= np.minimum(place[:-1], place[1:]) < most
+        onscreen &= np.maximum(place[:-1], place[1:]) >= -beside
+        onscreen &= np.minimum(place[:-1], place[1:]) < most + beside
     kept = np.flatnonzero(onscreen)
     longer = np.maximum(np.abs(np.diff(x)), np.abs(np.diff(y)))[kept]
     # Lines of as many samples come together, and then samples lie lines last: loops are long.

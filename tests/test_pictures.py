@@ -315,6 +315,27 @@ def test_triangles_of_any_size_leave_no_gap(cells):
     assert np.all(np.abs(depth - 2) < 0.25)
 
 
+@pytest.mark.parametrize("thickness", [1, 2, 3])
+def test_lines_across_the_border_are_those_of_a_wider_picture(thickness):
+    """They reach the picture's rows and columns nowhere but where they cross it."""
+    rng = np.random.default_rng(4)
+    places = rng.integers(-10 * 64, 50 * 64, (600, 3)).astype(np.float32) / 64
+    places[:, 2] = rng.uniform(1, 2, 600)
+    places[:, :2] *= places[:, 2:]
+    drawn = np.arange(600) % 2 == 0
+    buffers = {}
+    for border in (0, 20):
+        size = (40 + 2 * border, 30 + 2 * border)
+        camera = raster.Camera(np.zeros(3), np.eye(3), 60.0, size)
+        buffer = raster.empty_buffer(camera)
+        shifted = places + np.float32(border) * np.c_[places[:, 2:], places[:, 2:], np.zeros(600)]
+        raster.lines(camera, shifted.astype("f4"), drawn, buffer, bias=0.0, thickness=thickness)
+        buffers[border] = buffer.reshape(size[::-1])
+    inside = buffers[20][20:-20, 20:-20]
+    assert np.mean(inside != raster.empty_buffer(camera)[0]) > 0.9
+    np.testing.assert_array_equal(buffers[0], inside)
+
+
 def test_view_axes_are_right_handed_and_look_at_the_target():
     for azimuth, elevation in ((0.0, 0.0), (-1.2, 0.3), (2.0, np.pi / 2)):
         axes = raster.axes_towards(azimuth, elevation)
