@@ -200,7 +200,7 @@ def design(
 
     Arguments:
         verify: simulate the design afresh and finer, which takes longer than to find it.
-        progress: called with how many of 3 stages are done and what is done next.
+        progress: called with how many of 4 stages are done and what is done next.
 
     Raises Unreachable, with the nearest curl, where no rod of `RODS` and no treatment give it.
     """
@@ -228,7 +228,9 @@ def design(
     if verify:
         progress(2, "a finer simulation")
         finer = _simulated_finer(wish, found)
-    progress(3, "")
+    progress(3, "what uncertain hair changes")
+    sensitivities = _sensitivities(found, wish)
+    progress(4, "")
     waves = float(curl.waves[0])
     unmet = []
     if wish.waves is not None and abs(waves / wish.waves - 1) > 0.02:
@@ -245,7 +247,7 @@ def design(
         finer_curl_diameter=finer,
         met=not unmet,
         unmet=tuple(unmet),
-        sensitivities=_sensitivities(found, wish),
+        sensitivities=sensitivities,
         fit=found,
     )
 

@@ -24,7 +24,7 @@ from jaxhair.progress import Progress
 FILES = ("design.json", "designed.hair", "design.png")
 
 
-STAGES = 3
+STAGES = 4
 """Of a design, at most: the rod, another treatment, the finer simulation."""
 
 
