@@ -33,6 +33,7 @@ class Progress:
         self.done = 0
         self._shown, self._said = shown, ""
         self._began = self._told = time.monotonic()
+        self._line = ""
         # the first unit of work has compilation in it, so it says little of the others
         self._first: tuple[float, int] | None = None
         self._bar: Any = None
@@ -77,7 +78,10 @@ class Progress:
                 left = (now - since) / (self.done - before) * (self.total - self.done)
                 parts.append(f"about {left:.0f} s left")
         parts += [self._said] if self._said else []
-        print(", ".join(parts), file=sys.stderr, flush=True)
+        line = ", ".join(parts)
+        if line != self._line:  # the end may come just after a line that told it
+            print(line, file=sys.stderr, flush=True)
+        self._line = line
 
     def __enter__(self) -> "Progress":
         return self

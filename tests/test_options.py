@@ -349,6 +349,10 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(
         "working: 33/40 steps, 40 s, about 7 s left, error 32",
         "working: 40/40 steps, 47 s, error 39",
     ]
+    with Progress("working", 3, unit="step") as bar:
+        clock.now += 10
+        bar.update(3)
+    assert capsys.readouterr().err == "working: 3/3 steps, 10 s\n"  # not said again at the end
     assert list(each([1, 2], "working", unit="step", shown=False)) == [1, 2]
     assert capsys.readouterr().err == ""
 
