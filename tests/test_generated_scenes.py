@@ -1,8 +1,8 @@
 """Generated scenes, valid and wild: every value and forward derivative stays finite.
 
-An ordinary run takes 60 of them; 600 with HYPOTHESIS_PROFILE=full. All have the same effects,
-with numbers over many orders of magnitude, so that one compiled program a solver serves all. One
-that fails becomes a case of `tests/hard_cases`.
+An ordinary run takes 40 of them; 600 with HYPOTHESIS_PROFILE=full and the slow ones. All have the
+same effects, with numbers over many orders of magnitude, so that one compiled program a solver
+serves all. One that fails becomes a case of `tests/hard_cases`.
 """
 
 from typing import Any
