@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from jaxhair import check
 from jaxhair import quaternion as quat
@@ -16,8 +16,8 @@ from jaxhair.pytree import pytree
 from jaxhair.rods import Rod
 from jaxhair.strands import BONDS, State
 
-TINY = float(np.finfo(np.float32).tiny)
-"""Below it a number may count as 0 in float32."""
+TINY = 2.0**-60
+"""Below it the slope of 1 / x, which is x^-2, comes near what float32 holds."""
 
 
 @pytree
@@ -30,7 +30,7 @@ class Bonds:
         fraction: b_j at the start, in [0, 1]; of the same shapes.
 
     The defaults are the paper's table 1: hydrogen 33 %, with ionic 63 %, disulfide 20 %, peptide
-    17 %. Raises ValueError for influences below 0 or that sum to 0, and fractions outside [0, 1].
+    17 %. Raises ValueError for influences below 0 or all next to 0, and fractions outside [0, 1].
     """
 
     influence: Any = (0.33, 0.30, 0.20, 0.17)
@@ -45,7 +45,9 @@ class Bonds:
         check.fraction("bonds.fraction", self.fraction, many=True)
         f = check.known(self.influence)
         if f is not None and np.any(few := f.max(axis=-1, initial=0) < TINY):
-            raise ValueError(f"bonds.influence is {f[few][0].tolist()}; its sum must be above 0")
+            raise ValueError(
+                f"bonds.influence is {f[few][0].tolist()}; one must be at least {TINY:.0e}"
+            )
 
 
 def per_inner_point(x: Any) -> Array:
@@ -84,7 +86,7 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
 
     shape = sum_j f_j b_j Omega_j / sum_j f_j b_j, free of stress, and
     share = sum_j f_j b_j / sum_j f_j, the part of the whole stiffness that is bonded. Where all
-    bonds are cut the share is 0 and the shape straight.
+    bonds are cut, or but for next to nothing, the share is 0 and the shape straight.
 
     Arguments: as in `rest_shape`.
     Returns shape as unit quaternions, shape (inner points, 4, strands), and share, shape (inner
@@ -92,10 +94,18 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
     """
     bonded = influence * fractions
     whole = jnp.sum(bonded, axis=1, keepdims=True)
-    cut = whole == 0
+    share = whole / jnp.sum(influence, axis=1, keepdims=True)
+    cut = share <= _nothing(share)
+    share = share - jnp.where(cut, lax.stop_gradient(share), 0)  # 0 if cut, with its slope
     each = [bonded[:, j, None] * shapes[:, j] for j in range(len(BONDS))]
     shape = sum(each[1:], each[0]) / jnp.where(cut, 1, whole)
-    return quat.from_vector_part(shape), whole / jnp.sum(influence, axis=1, keepdims=True)
+    return quat.from_vector_part(shape), share
+
+
+def _nothing(x: Array) -> float:
+    """A share of bonds that holds nothing, below rounding by as much again. Divided by less, shapes
+    have slopes that overflow."""
+    return float(np.finfo(x.dtype).eps) ** 2
 
 
 def present_shape(r: Array, remembered: Array) -> Array:
@@ -111,12 +121,14 @@ def present_shape(r: Array, remembered: Array) -> Array:
 def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
     """Omega_j <- (b_j Omega_j + db_j Omega) / (b_j + db_j) where db_j > 0 (Eq. 16).
 
+    Where b_j + db_j is next to nothing, what is remembered does not count yet and stays.
+
     Arguments:
         shape: Omega_j of one kind, shape (inner points, 3, strands).
         fraction: b_j before the rise. rise: db_j; both of shape (inner points, strands).
         r: conj(q1) q2, whose vector part is Omega, shape (inner points, 4, strands).
     """
-    rises = rise > 0
+    rises = (rise > 0) & (fraction + rise > _nothing(fraction))
     new = jnp.where(rises, rise / jnp.where(rises, fraction + rise, 1), 0)[:, None]
     return shape + new * (present_shape(r, shape) - shape)
 

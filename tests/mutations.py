@@ -207,6 +207,20 @@ MUTATIONS = (
     ),
     Mutation(
         "jaxhair/bonds.py",
+        "bonds cut but for next to nothing",
+        "cut = share <= _nothing(share)",
+        "cut = share == 0",
+        hard("cut_but_for_next_to_nothing", solver="direct"),
+    ),
+    Mutation(
+        "jaxhair/bonds.py",
+        "bonds formed by next to nothing",
+        "rises = (rise > 0) & (fraction + rise > _nothing(fraction))",
+        "rises = rise > 0",
+        hard("formed_by_next_to_nothing", solver="direct"),
+    ),
+    Mutation(
+        "jaxhair/bonds.py",
         "b + db = 0",
         "rise / jnp.where(rises, fraction + rise, 1)",
         "rise / (fraction + rise)",

@@ -92,7 +92,10 @@ MATERIAL: list[Case] = [
     (lambda: jh.Fibre(peeling_rate=-1), "fibre.peeling_rate|-1|0 or more"),
     (lambda: jh.Bonds(influence=(1, 1, 1)), "bonds.influence|(3,)|(4,)"),
     (lambda: jh.Bonds(influence=(1, 1, 1, -1)), "bonds.influence|-1.0 at (3,)|0 or more"),
-    (lambda: jh.Bonds(influence=(0, 0, 0, 0)), "bonds.influence|[0.0, 0.0, 0.0, 0.0]|above 0"),
+    (
+        lambda: jh.Bonds(influence=(0, 0, 0, 0)),
+        "bonds.influence|[0.0, 0.0, 0.0, 0.0]|at least 9e-19",
+    ),
     (lambda: jh.Bonds(influence=(1, 1, 1, NAN)), "bonds.influence|nan|finite"),
     (lambda: jh.Bonds(influence=("a", "b", "c", "d")), f"bonds.influence|'a'|{NUMBER}"),
     (lambda: jh.Bonds(influence=None), "bonds.influence|shape ()|(4,)"),

@@ -125,6 +125,24 @@ def all_bonds_cut(s: Setting) -> jh.Scene:
     return s.scene(COIL, *HANGING, bonds=jh.Bonds(fraction=(0.0, 0.0, 0.0, 0.0)))
 
 
+@hard(
+    breaks="bonds cut but for next to nothing: the slope of 1 / (sum of f_j b_j) overflows",
+    smooth="the shape free of stress jumps where the last bond is cut",
+)
+def cut_but_for_next_to_nothing(s: Setting) -> jh.Scene:
+    nothing = float(np.finfo(s.dtype).tiny) ** 0.8
+    return s.scene(COIL, *HANGING, bonds=jh.Bonds(fraction=(0.0, 0.0, 0.0, nothing)))
+
+
+@hard(
+    breaks="bonds that have all but not formed: the slope of db_j / (b_j + db_j) overflows",
+    smooth="the remembered shape jumps where the first bond forms",
+)
+def formed_by_next_to_nothing(s: Setting) -> jh.Scene:
+    nothing = float(np.finfo(s.dtype).tiny) ** 0.8
+    return s.scene(COIL, *treated(0.0, 2 * nothing), bonds=jh.Bonds(fraction=(nothing, 1, 1, 1)))
+
+
 @hard(breaks="one f_j is 0")
 def one_influence_0(s: Setting) -> jh.Scene:
     return s.scene(COIL, *HANGING, bonds=jh.Bonds((0.0, 0.3, 0.2, 0.17)))
