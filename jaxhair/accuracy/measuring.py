@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -14,11 +14,13 @@ from jaxhair.accuracy.problem import (
     PARAMETERS,
     Problem,
     Reference,
-    common_points,
+    common,
     gradient_error,
     precision,
     shape_error,
 )
+from jaxhair.scene import Scene
+from jaxhair.simulate import phase_end, start
 
 LARGEST_ERROR = 0.5
 """Over the length; above it a setting has failed."""
@@ -76,9 +78,8 @@ def measure(problem: Problem, reference: Reference, setting: Setting) -> Row:
         )
         forward = _cost(
             problem,
-            common_points,
-            (scene,),
-            lambda x: shape_error(problem, reference, x),
+            lambda: _forward(scene),
+            lambda x: shape_error(problem, reference, np.asarray(common(jnp.asarray(x)))),
             LARGEST_ERROR,
         )
         gradient = None
@@ -86,33 +87,59 @@ def measure(problem: Problem, reference: Reference, setting: Setting) -> Row:
             at = jnp.zeros(len(PARAMETERS), scene.dtype)
             gradient = _cost(
                 problem,
-                jax.grad(problem.height),
-                (at, scene),
+                lambda: _gradient(problem, scene, at),
                 lambda g: gradient_error(reference, g),
                 LARGEST_GRADIENT_ERROR,
             )
     return Row(setting, forward, gradient)
 
 
+def _forward(scene: Scene) -> tuple[Callable[[], Any], int | None]:
+    """A call that simulates a scene as `jaxhair.run` does, and the most memory of a phase."""
+    bare, first = replace(scene, phases=()), start(scene)
+    state, programs = first, []
+    for phase in scene.phases:
+        arguments = {"steps": phase.steps(scene.dt), "kernels": True}
+        program = phase_end.lower(bare, phase.effects, state, **arguments).compile()
+        programs.append((program, phase.effects))
+        if phase is not scene.phases[-1]:
+            state = program(bare, phase.effects, state)
+
+    def call() -> Any:
+        state = first
+        for program, effects in programs:
+            state = program(bare, effects, state)
+        return state.positions
+
+    sizes = [_memory(program) for program, _ in programs]
+    return call, None if None in sizes else max(x for x in sizes if x is not None)
+
+
+def _gradient(problem: Problem, scene: Scene, at: Any) -> tuple[Callable[[], Any], int | None]:
+    """A call that gives the height's gradient, and the memory of its program."""
+    program = jax.jit(jax.grad(problem.height)).lower(at, scene).compile()
+    return lambda: program(at, scene), _memory(program)
+
+
 def _cost(
     problem: Problem,
-    function: Callable[..., Any],
-    arguments: tuple[Any, ...],
+    made: Callable[[], tuple[Callable[[], Any], int | None]],
     error_of: Callable[[np.ndarray], float],
     largest: float,
 ) -> Cost:
+    """Of what `made` compiles: a call and its memory."""
     begin = time.perf_counter()
     try:
-        program = jax.jit(function).lower(*arguments).compile()
+        call, memory = made()
         compiled = time.perf_counter() - begin
-        result, seconds = _timed(lambda: program(*arguments))
+        result, seconds = _timed(call)
     except jax.errors.JaxRuntimeError:  # such as too little memory
         nan = float("nan")
         return Cost("failed", float("inf"), nan, time.perf_counter() - begin, None)
     value = np.asarray(result)
     error = error_of(value) if np.all(np.isfinite(value)) else float("inf")
     status = "ok" if error <= largest else "failed"
-    return Cost(status, error, seconds / problem.seconds, compiled, _memory(program))
+    return Cost(status, error, seconds / problem.seconds, compiled, memory)
 
 
 def _timed(call: Callable[[], Any]) -> tuple[Any, float]:

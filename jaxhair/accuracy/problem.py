@@ -107,8 +107,12 @@ class Problem:
 
 def common_points(scene: Scene) -> Array:
     """The common points at the end, from the root [m], shape (9, 3, strands)."""
-    x = run(scene)["perm"].positions
-    x = x[:: (scene.strands.points - 1) // (COMMON - 1)]
+    return common(run(scene)["perm"].positions)
+
+
+def common(positions: Array) -> Array:
+    """Those of the points that all settings have, from the root [m], shape (9, 3, strands)."""
+    x = positions[:: (positions.shape[0] - 1) // (COMMON - 1)]
     return x - x[:1]
 
 
