@@ -25,7 +25,7 @@ FILES = ("design.json", "designed.hair", "design.png")
 
 
 STAGES = 4
-"""Of a design, at most: the rod, another treatment, the finer simulation."""
+"""Of a design, at most: the rod, another treatment, the finer simulation, what is uncertain."""
 
 
 def parser() -> Parser:
