@@ -43,7 +43,7 @@ EXTREME: list[Case] = [
     (lambda: jh.Drag(np.longdouble(1)), "Drag.time|number"),
     (lambda: jh.Drag(np.ma.masked_array(0.1)), "Drag.time|number"),
     (lambda: jh.Drag(jax.random.key(0)), "Drag.time|number"),
-    (lambda: jh.Bonds((1e-39, 0, 0, 0)), "bonds.influence|1e-39|above 0"),
+    (lambda: jh.Bonds((1e-39, 0, 0, 0)), "bonds.influence|1e-39|at least 9e-19"),
     (lambda: jh.Bonds([[1], [1, 2]]), "bonds.influence|[[1], [1, 2]]|number"),
     (lambda: jh.Wind(O, (1e-200, 0, 0), 1.0), "Wind.target|differ from the blower"),
     (lambda: jh.Hold(centre=O), "Hold.centre|array([0., 0., 0.])|None without angular_velocity"),
