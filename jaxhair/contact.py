@@ -11,13 +11,11 @@ from jax import Array, lax
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import RememberingEffect
-from jaxhair.neighbours import near_pairs
+from jaxhair.neighbours import batch_here, near_pairs
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.strands import State
 
-CHUNK, WIDE = 2**15, 2**20
-"""Pairs whose pushes are computed together: what fits into a CPU's cache, and on a GPU more."""
 FULL = 0.8
 """Share of the room in lists that a new skin is meant to fill."""
 LEAST = 1e-3
@@ -128,7 +126,7 @@ class HairContact(RememberingEffect):
         """Lists that hold nowhere."""
         points, _, strands = state.positions.shape
         room = points * strands * min(self.capacity, (points - 1) * max(strands - 1, 1))
-        chunks = -(-room // (CHUNK if jax.default_backend() == "cpu" else WIDE))
+        chunks = -(-room // batch_here().pushes)
         none = jnp.full((chunks, -(-room // chunks)), points * strands, jnp.int32)
         x = lax.stop_gradient(state.positions)
         return Lists(

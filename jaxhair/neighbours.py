@@ -19,20 +19,27 @@ class Batch(NamedTuple):
     """What is worked on together.
 
     groups: pairs of groups whose blocks are compared. blocks: pairs of blocks whose distances are
-    computed. pairs: pairs of a point and an edge that are listed.
+    computed. pairs: pairs of a point and an edge that are listed. pushes: pairs whose contact is
+    computed.
     """
 
     groups: int
     blocks: int
     pairs: int
+    pushes: int
 
 
-IN_CACHE = Batch(1, 64, 512)
+IN_CACHE = Batch(1, 64, 512, 2**15)
 """For a CPU, where a batch should stay in cache."""
-WIDE = Batch(128, 2**13, 2**17)
+WIDE = Batch(128, 2**13, 2**17, 2**20)
 """For a GPU, where a batch should fill the device: on an H200 the contact of 20,000 strands takes
 a hundredth of the time that it takes in batches for a CPU
 (`tests/benchmarks/accelerator.py contact`)."""
+
+
+def batch_here() -> Batch:
+    """What suits JAX's device."""
+    return IN_CACHE if jax.default_backend() == "cpu" else WIDE
 
 
 class Pairs(NamedTuple):
@@ -65,7 +72,7 @@ def near_pairs(
         reach: [m], shape ().
         batch: what is worked on together; by default what suits JAX's device.
     """
-    batch = batch or (IN_CACHE if jax.default_backend() == "cpu" else WIDE)
+    batch = batch or batch_here()
     size = starts.shape[1]
     order = jnp.argsort(_along_the_curve(starts)).astype(jnp.int32)
     groups = -(-size // BLOCK**2)

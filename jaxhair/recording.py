@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxhair import check, diagnosis, tiles
+from jaxhair.compiling import compile_together
 from jaxhair.kernels import allowed
 from jaxhair.progress import Progress
 from jaxhair.pytree import pytree, static
@@ -253,6 +254,8 @@ def _interruptible(
         return [], False, (None, None, saved.state, 0, 0)
     number = 0
     try:
+        if devices == 1:  # on several, states are spread over them only once they are simulated
+            _compile(scene, observe, every, saved.state, len(frames))
         for phase in scene.phases:
             setup, first = None, 0
             for steps in _frame_steps(phase, every, scene.dt):
@@ -278,6 +281,18 @@ def _interruptible(
         saved.save(frames[: kept[0]], kept[1], now=True)
         bar.close()
     return frames, True, None
+
+
+def _compile(
+    scene: Scene, observe: Callable[[State], Any], every: int, state: State, done: int
+) -> None:
+    """Compiles the programs of all phases that have frames after the first `done`."""
+    bare, number, calls, at = replace(scene, phases=()), 1, [], jnp.int32(0)
+    for phase in scene.phases:
+        number += len(_frame_steps(phase, every, scene.dt))
+        if number > done:
+            calls.append((observe, _prepare(bare, phase.effects, 1), state, at, at))
+    compile_together(_frame, calls)
 
 
 def _finite(tree: Any) -> bool:

@@ -96,7 +96,7 @@ def test_many_strands() -> None:
 @pytest.mark.parametrize(
     ("reach", "batch"),
     [(0.0, IN_CACHE), (1e-3, IN_CACHE), (1e-2, IN_CACHE), (1.0, IN_CACHE)]
-    + [(1e-2, WIDE), (1e-3, Batch(3, 7, 50)), (1e-2, Batch(4, 100, 1000))],
+    + [(1e-2, WIDE), (1e-3, Batch(3, 7, 50, 1)), (1e-2, Batch(4, 100, 1000, 1))],
 )
 def test_pairs_are_those_of_a_search_by_brute_force(reach: float, batch: Batch) -> None:
     """Each once, and none too many; also with points and edges that are missing."""

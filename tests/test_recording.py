@@ -10,6 +10,7 @@ import pytest
 
 import jaxhair as jh
 from jaxhair import recording
+from jaxhair.compiling import compile_together
 from jaxhair.effects import VelocityEffect
 
 SAME = 1e-12  # eager against traced and against `run`, float64 [m]
@@ -33,7 +34,7 @@ class Fails(VelocityEffect):
 def scene_of(*effects: tuple) -> jh.Scene:
     """Two strands of three points, and a phase of 7 steps for each tuple of effects."""
     hair = jh.Strands.straight(np.eye(3)[:2], (1.0, 0, 0), length=0.1, points=3)
-    phases = tuple(jh.Phase("ab"[i], 7 * DT, e) for i, e in enumerate(effects))
+    phases = tuple(jh.Phase("abc"[i], 7 * DT, e) for i, e in enumerate(effects))
     return jh.Scene(hair, phases=phases, dt=DT)
 
 
@@ -217,3 +218,48 @@ def test_float32_times_and_values() -> None:
     movie = jh.simulate(scene, fps=FPS)
     assert movie.positions.dtype == np.float32
     np.testing.assert_allclose(movie.positions, eager().positions, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_phases_are_compiled_before_they_are_simulated(
+    dtype: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Side by side, each program once, as it is called: the calls compile nothing more."""
+    compiled: list[int] = []
+
+    def together(program: Any, calls: Any) -> None:
+        calls = list(calls)
+        compile_together(program, calls)
+        compiled.append(len(calls))
+        caplog.clear()
+
+    monkeypatch.setattr(recording, "compile_together", together)
+    with jax.enable_x64(dtype == "float64"), jax.log_compiles():
+        hold, reform = jh.Hold(), jh.Reform(hydrogen=1.0)
+        movie = jh.simulate(scene_of((hold, jh.Gravity()), (hold, reform), (hold, jh.Gravity())))
+    assert movie.positions.dtype == dtype
+    assert compiled == [3]
+    assert not [m for m in caplog.messages if "_frame" in m and "compil" in m.lower()]
+
+
+def test_programs_that_are_compiled_together(caplog: pytest.LogCaptureFixture) -> None:
+    """One for all calls that share it, and none where there is only one."""
+
+    @jax.jit
+    def doubled(x: Any) -> Any:
+        return 2 * x
+
+    def compiling() -> int:
+        return sum("Compiling jit(doubled)" in m for m in caplog.messages)
+
+    one, two = jnp.ones(3), jnp.ones(5)
+    with jax.log_compiles():
+        compile_together(doubled, [(one,), (2 * one,)])
+        assert compiling() == 0
+        compile_together(doubled, [(one,), (two,), (2 * one,)])
+        caplog.clear()
+        np.testing.assert_array_equal(doubled(one), 2)
+        np.testing.assert_array_equal(doubled(two), 2)
+        assert compiling() == 0
+        doubled(jnp.ones(7))
+        assert compiling() == 1
