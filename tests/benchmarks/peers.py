@@ -3,7 +3,8 @@
 PEERS is the folder of the peers' programs, each of which simulates the same scene: strands clamped
 at their roots, gravity, 5 iterations, a rest shape of four bonds, of which two kinds re-form.
 PYTHON is an interpreter that has numba, if this one does not. Microseconds a step, the least of
-many runs, float32, compilation apart; ratios to vectorised Numba on as many threads.
+many runs, float32, compilation apart; ratios to vectorised Numba on as many threads. Also a
+reverse-mode gradient, forward run included, beside that of Warp's tape if PYTHON has warp-lang.
 """
 
 import argparse
@@ -12,11 +13,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxhair as jh
@@ -29,6 +32,8 @@ SOLVERS = {
     "sequential": jh.PositionBased(sweep="sequential"),
     "direct": jh.Direct(),
 }
+GRADIENTS = ((200, 9), (64, 33))
+STEPS = 60  # that a gradient goes back
 OTHERS = {"numba, vectorised": "nb_flat.py", "numba, plain": "nb_rods.py"}
 
 
@@ -43,6 +48,16 @@ def scene(strands: int, points: int, solver: Any) -> jh.Scene:
     return jh.Scene(hair, bonds=bonds, phases=(jh.Phase("fall", 1.0, effects),), solver=solver)
 
 
+def least(call: Callable[[], Any]) -> float:
+    """Seconds of the fastest of many calls, but for the first."""
+    times: list[float] = []
+    while len(times) < 5 or (len(times) < 200 and sum(times) < 3):
+        begin = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - begin)
+    return min(times[1:])
+
+
 def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tuple[float, float]:
     """Microseconds a step, and seconds of tracing and compiling."""
     built = scene(strands, points, solver).as_arrays()
@@ -52,20 +67,76 @@ def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tup
     run = jax.jit(lambda *x: phase_end(*x, steps=steps, kernels=True), compiler_options=options)
     program = run.lower(bare, effects, state).compile()
     compilation = time.perf_counter() - begin
-    times = []
-    while len(times) < 5 or (len(times) < 200 and sum(times) < 3):
-        begin = time.perf_counter()
-        jax.block_until_ready(program(bare, effects, state))
-        times.append(time.perf_counter() - begin)
-    return 1e6 * min(times[1:]) / steps, compilation
+    return 1e6 * least(lambda: program(bare, effects, state)) / steps, compilation
 
 
-def theirs(python: str, program: Path, file: Path, threads: int) -> float | None:
-    """Microseconds a step as a peer prints it; None where it does not run."""
-    command = [python, str(program), str(file), "--threads", str(threads)]
+def our_gradient(strands: int, points: int, solver: Any) -> tuple[float, float]:
+    """Microseconds a step of a forward run, and of one with the gradient in what is remembered."""
+    built = scene(strands, points, solver).as_arrays()
+    effects, state, bare = built.phases[0].effects, start(built), replace(built, phases=())
+    along = np.random.default_rng(1).normal(size=state.positions.shape).astype(np.float32)
+
+    def loss(shapes: Any) -> Any:
+        end = phase_end(bare, effects, replace(state, shapes=shapes), steps=STEPS)
+        return jnp.sum(along * end.positions)
+
+    gradient = jax.jit(jax.value_and_grad(loss))
+    forward = least(lambda: phase_end(bare, effects, state, steps=STEPS, kernels=True))
+    return 1e6 * forward / STEPS, 1e6 * least(lambda: gradient(state.shapes)) / STEPS
+
+
+def printed(python: str, program: Path, options: list[str], pattern: str) -> float | None:
+    """The number that a peer prints where the pattern says; None where it does not run."""
+    command = [python, str(program), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    found = re.search(r"min ([\d.]+)", done.stdout)
+    found = re.search(pattern, done.stdout)
     return float(found.group(1)) if found else None
+
+
+def written(options: argparse.Namespace, strands: int, points: int, folder: str) -> str:
+    """The file with the peers' scene, for the peers to read."""
+    file, program = str(Path(folder) / "scene.bin"), str(options.peers / "scene" / "scene.py")
+    command = [options.python, program, "write", str(strands), str(points), file]
+    subprocess.run(command, check=True)
+    return file
+
+
+def steps(options: argparse.Namespace, strands: int, points: int) -> None:
+    """Times of a step of all programs."""
+    base = {}
+    with tempfile.TemporaryDirectory() as folder:
+        file = written(options, strands, points, folder)
+        for name, program in OTHERS.items():
+            for threads in (1, 2):
+                path = options.peers / "numba" / program
+                more = [file, "--threads", str(threads)]
+                taken = printed(options.python, path, more, r"min ([\d.]+)")
+                if taken is not None:
+                    base.setdefault(threads, taken)
+                    print(f"  {name + f', {threads} threads':<34} {taken:9.1f}")
+    for name, solver in SOLVERS.items():
+        for more, compiled in (("", {}), (", vectors of 512 bits", WIDTH)):
+            taken, compilation = ours(strands, points, solver, compiled)
+            ratios = [f"{taken / x:5.2f} of numba on {n}" for n, x in base.items()]
+            print(
+                f"  {name + more:<34} {taken:9.1f}  compiled in {compilation:4.1f} s  "
+                + "  ".join(ratios)
+            )
+
+
+def gradients(options: argparse.Namespace, strands: int, points: int) -> None:
+    """Times of a step of a gradient, forward run included."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = written(options, strands, points, folder)
+        path = options.peers / "warp" / "wp_rods.py"
+        more = [file, "--mode", "grad", "--steps", str(STEPS)]
+        warp = printed(options.python, path, more, r"forward\+backward ([\d.]+)")
+    if warp is not None:
+        print(f"  {'Warp':<34} {warp:9.1f}")
+    for name, solver in SOLVERS.items():
+        forward, taken = our_gradient(strands, points, solver)
+        ratio = "" if warp is None else f"  {taken / warp:5.2f} of Warp"
+        print(f"  {name:<34} {taken:9.1f}  {taken / forward:5.1f} forward runs{ratio}")
 
 
 def main() -> None:
@@ -76,26 +147,10 @@ def main() -> None:
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}; microseconds a step")
     for strands, points in SIZES:
         print(f"\n{strands:,} strands of {points} points")
-        base = {}
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "scene.bin"
-            write = [options.python, str(options.peers / "scene" / "scene.py"), "write"]
-            subprocess.run([*write, str(strands), str(points), str(file)], check=True)
-            for name, program in OTHERS.items():
-                for threads in (1, 2):
-                    path = options.peers / "numba" / program
-                    taken = theirs(options.python, path, file, threads)
-                    if taken is not None:
-                        base.setdefault(threads, taken)
-                        print(f"  {name + f', {threads} threads':<34} {taken:9.1f}")
-        for name, solver in SOLVERS.items():
-            for more, compiled in (("", {}), (", vectors of 512 bits", WIDTH)):
-                taken, compilation = ours(strands, points, solver, compiled)
-                ratios = [f"{taken / x:5.2f} of numba on {n}" for n, x in base.items()]
-                print(
-                    f"  {name + more:<34} {taken:9.1f}  compiled in {compilation:4.1f} s  "
-                    + "  ".join(ratios)
-                )
+        steps(options, strands, points)
+    for strands, points in GRADIENTS:
+        print(f"\ngradient, {strands:,} strands of {points} points, {STEPS} steps")
+        gradients(options, strands, points)
 
 
 if __name__ == "__main__":
