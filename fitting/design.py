@@ -279,7 +279,7 @@ def _with(scene: Scene, values: Mapping[str, float]) -> Scene:
 def _simulated_finer(wish: Wish, found: Fit) -> float:
     """Diameter of the designed curl in a finer simulation [m]."""
     used = {name: _value(found, name) for name in (ROD, LEFT, CLIMB)}
-    ends = jax.jit(run)(_with(wish.scene(finer=True), used))
+    ends = run(_with(wish.scene(finer=True), used))
     return float(measures.curl_diameter(ends[wish.state].points)[0])
 
 

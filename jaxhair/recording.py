@@ -247,7 +247,7 @@ def _interruptible(
     total = sum(phase.steps(scene.dt) for phase in scene.phases)
     bar = Progress("simulating", total, unit="step", shown=progress)
     bare = replace(scene, phases=())
-    frames = saved.frames or [jax.tree.map(np.asarray, observe(saved.state))]
+    frames = saved.frames or [jax.tree.map(np.asarray, jax.jit(observe)(saved.state))]
     # how many frames, and the state after them, in one object: Ctrl-C may come at any statement
     kept = (len(frames), saved.state)
     if not _finite((frames[0], saved.state)):

@@ -24,13 +24,13 @@ from jaxhair.effects import (
     of_kind,
 )
 from jaxhair.fibre import Fibre, PhysicalFibre, material, stiffness
-from jaxhair.kernels import allowed, one_kernel
+from jaxhair.kernels import Kernels, allowed, kernels_here, one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
 from jaxhair.scene import Scene
 from jaxhair.solvers import Solver
-from jaxhair.strands import State, strands_last
+from jaxhair.strands import State, Strands, strands_last
 
 
 @pytree
@@ -189,17 +189,23 @@ def prepare(scene: Scene, effects: tuple[Effect, ...], devices: int = 1) -> Setu
 
 def start(scene: Scene) -> State:
     """The state before the first step: at rest, every bond remembering the natural shape."""
-    positions = strands_last(scene.strands.positions)
-    shape = strands_last(scene.strands.natural_shape)
+    forces = scene.solver.keeps_forces
+    return _start(scene.strands, scene.bonds.fraction, forces)
+
+
+@partial(jax.jit, static_argnames="keeps_forces")
+def _start(strands: Strands, fraction: Any, keeps_forces: bool) -> State:
+    positions = strands_last(strands.positions)
+    shape = strands_last(strands.natural_shape)
     shapes = jnp.broadcast_to(shape[:, None], (shape.shape[0], 4, *shape.shape[1:]))
-    fractions = bond.per_inner_point(scene.bonds.fraction)
+    fractions = bond.per_inner_point(fraction)
     return State(
         positions,
         jnp.zeros_like(positions),
-        strands_last(scene.strands.orientations),
+        strands_last(strands.orientations),
         shapes,
         jnp.broadcast_to(fractions, (shape.shape[0], 4, shape.shape[2])),
-        jnp.zeros_like(positions[1:]) if scene.solver.keeps_forces else None,
+        jnp.zeros_like(positions[1:]) if keeps_forces else None,
     )
 
 
@@ -259,7 +265,7 @@ def phase_end(
     *,
     steps: int,
     devices: int = 1,
-    kernels: bool = False,
+    kernels: Kernels = "none",
 ) -> State:
     """The state after a phase. Phases that differ only in numbers share the compiled program.
 
@@ -288,7 +294,7 @@ def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
     devices = tiles.checked_devices(scene, devices)
     scene = scene.as_arrays()
     state = start(scene)
-    kernels = not check.traced((scene, state))
+    kernels = kernels_here() if check.traced((scene, state)) else "values"
     bare = replace(scene, phases=())
     ends = {}
     for phase in scene.phases:

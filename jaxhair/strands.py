@@ -6,12 +6,13 @@ lanes of the processor's vector registers.
 """
 
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from jaxhair import check
 from jaxhair import quaternion as quat
@@ -170,40 +171,18 @@ class Strands:
         strands, size, _ = positions.shape
         if size < 2:
             raise ValueError(f"points has {size} point a strand; it must have 2 or more")
-        ragged = counts is not None
+        ragged, exists, last = counts is not None, None, None
         if ragged:
             check.shape("counts", counts, (strands,))
             n = np.asarray(None if isinstance(counts, jax.core.Tracer) else counts)
             if n.dtype.kind not in "iu" or np.any((n < 2) | (n > size)):
                 wanted = f"each must be a whole number in [2, {size}]"
                 raise ValueError(f"counts is {check.short(n)}; {wanted}")
-            last = jnp.asarray(np.minimum(np.arange(size), n[:, None] - 1))
-            positions = jnp.take_along_axis(positions, last[..., None], axis=1)
-        x = strands_last(positions)
-        edges = x[1:] - x[:-1]
-        lengths = quat.safe_norm(edges)
-        exists = None
-        if ragged:
-            exists = jnp.asarray(np.arange(size - 1)[:, None, None] < n - 1)
-        _check_apart(lengths, exists)
-        tangents = quat.unit(edges)
-        if exists is not None:  # missing edges go straight on, which keeps their frames unit
-            tangents = _carried(tangents, exists)
-        turns = quat.between(tangents[:-1], tangents[1:])
-        root = quat.between(_e3_like(tangents[0]), tangents[0])
-        frames = [root]
-        for turn in turns:
-            frames.append(quat.unit(quat.multiply(turn, frames[-1])))
-        q = jnp.stack(frames)
-        r = quat.relative(q[:-1], q[1:])
-        shape = r[:, 1:] * jnp.where(r[:, :1] < 0, -1, 1).astype(r.dtype)
-        return Strands(
-            positions,
-            strands_first(q),
-            strands_first(lengths[:, 0]),
-            strands_first(shape),
-            ragged,
-        )
+            last = np.asarray(n - 1, np.int32)
+            exists = (np.arange(size - 1)[:, None] < last)[:, None]
+        positions, q, lengths, shape = _framed(positions, last)
+        _check_apart(strands_last(lengths)[:, None], exists)
+        return Strands(positions, q, lengths, shape, ragged)
 
     @staticmethod
     def straight(
@@ -232,15 +211,53 @@ class Strands:
             wanted = f"all strands together must have at most {MOST_POINTS}"
             raise ValueError(f"points is {points} for {strands} strands; {wanted}")
         dtype = _floating(dtype)
-        start = strands_last(jnp.asarray(roots, dtype))
-        t = quat.unit(strands_last(jnp.broadcast_to(jnp.asarray(directions, dtype), (strands, 3))))
-        along = jnp.linspace(0.0, length, points).astype(dtype)
-        x = start[None] + along[:, None, None] * t[None]
-        q = quat.between(_e3_like(t), t)
-        q = jnp.broadcast_to(q[None], (points - 1, *q.shape))
-        lengths = jnp.full((1, points - 1), length / (points - 1), dtype)
-        shape = jnp.zeros((t.shape[-1], points - 2, 3), dtype)
-        return Strands(strands_first(x), strands_first(q), lengths, shape)
+        roots, directions = jnp.asarray(roots, dtype), jnp.asarray(directions, dtype)
+        length = length if check.traced(length) else float(length)
+        return Strands(*_straight(roots, directions, length, points))
+
+
+# Compiled, each of these takes a tenth of a second the first time; operation by operation, three.
+
+
+@jax.jit
+def _framed(positions: Array, last: Array | None) -> tuple[Array, Array, Array, Array]:
+    """Arrays of `Strands` through points; behind the `last` of each strand they repeat it."""
+    if last is not None:
+        place = jnp.minimum(jnp.arange(positions.shape[1]), last[:, None])
+        positions = jnp.take_along_axis(positions, place[..., None], axis=1)
+    x = strands_last(positions)
+    edges = x[1:] - x[:-1]
+    lengths, tangents = quat.safe_norm(edges), quat.unit(edges)
+    if last is not None:  # missing edges go straight on, which keeps their frames unit
+        place = jnp.minimum(jnp.arange(len(edges))[:, None], last - 1)
+        tangents = jnp.take_along_axis(tangents, place[:, None], axis=0)
+
+    def carried(q: Array, turn: Array) -> tuple[Array, Array]:
+        q = quat.unit(quat.multiply(turn, q))
+        return q, q
+
+    root = quat.between(_e3_like(tangents[0]), tangents[0])
+    _, others = lax.scan(carried, root, quat.between(tangents[:-1], tangents[1:]))
+    q = jnp.concatenate([root[None], others])
+    r = quat.relative(q[:-1], q[1:])
+    shape = r[:, 1:] * jnp.where(r[:, :1] < 0, -1, 1).astype(r.dtype)
+    return positions, strands_first(q), strands_first(lengths[:, 0]), strands_first(shape)
+
+
+@partial(jax.jit, static_argnames="points")
+def _straight(
+    roots: Array, directions: Array, length: Any, points: int
+) -> tuple[Array, Array, Array, Array]:
+    """Arrays of `Strands` that are straight."""
+    start, dtype = strands_last(roots), roots.dtype
+    t = quat.unit(strands_last(jnp.broadcast_to(directions, roots.shape)))
+    along = jnp.linspace(0.0, length, points).astype(dtype)
+    x = start[None] + along[:, None, None] * t[None]
+    q = quat.between(_e3_like(t), t)
+    q = jnp.broadcast_to(q[None], (points - 1, *q.shape))
+    lengths = jnp.full((1, points - 1), length / (points - 1), dtype)
+    shape = jnp.zeros((t.shape[-1], points - 2, 3), dtype)
+    return strands_first(x), strands_first(q), lengths, shape
 
 
 def _floating(dtype: Any) -> Any:
@@ -257,19 +274,11 @@ def _e3_like(t: Array) -> Array:
     return jnp.zeros_like(t).at[2].set(1)
 
 
-def _carried(tangents: Array, exists: Array) -> Array:
-    """Tangents (edges, 3, strands) in which missing edges repeat the one before."""
-    rows = [tangents[0]]
-    for t, there in zip(tangents[1:], exists[1:], strict=True):
-        rows.append(jnp.where(there, t, rows[-1]))
-    return jnp.stack(rows)
-
-
-def _check_apart(lengths: Array, exists: Array | None) -> None:
+def _check_apart(lengths: Array, exists: np.ndarray | None) -> None:
     known = check.known(lengths)
     if known is None:
         return
-    there = np.ones(known.shape, bool) if exists is None else np.asarray(exists)
+    there = np.ones(known.shape, bool) if exists is None else exists
     if np.any(wrong := (known < check.SMALLEST) & there):
         edge, _, strand = (int(i) for i in np.argwhere(wrong)[0])
         raise ValueError(

@@ -166,7 +166,7 @@ def lowered_phase(
     phase = jh.Phase("phase", 0.1, effects)
     scene = jh.Scene(hair, phases=(phase,), solver=solver).as_arrays()
     bare = replace(scene, phases=())
-    return phase_end.lower(bare, scene.phases[0].effects, start(scene), steps=4, kernels=True)
+    return phase_end.lower(bare, scene.phases[0].effects, start(scene), steps=4, kernels="values")
 
 
 def step_call(lowered: Any) -> str:
@@ -240,7 +240,7 @@ def test_programs_of_users_have_none() -> None:
         return lax.while_loop(lambda carry: carry[0] < n, more, (0, jnp.zeros_like(x)))[1]
 
     one = jnp.asarray(1.0, scene.dtype)
-    with kernels.allowed(False):
+    with kernels.allowed("none"):
         assert MARK not in looped.lower(one, jnp.asarray(3)).as_text()
         assert MARK not in jax.jit(lambda: jh.run(scene)).lower().as_text()
         found = float(looped(one, jnp.asarray(3)))
