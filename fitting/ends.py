@@ -9,13 +9,11 @@ from jax import Array
 
 from fitting.tiles import TILE, has_strands
 from jaxhair import Scene, named_leaves, run
-from jaxhair.kernels import allowed
 
 
 @partial(jax.jit, static_argnames="states")
 def _ends(scene: Scene, states: tuple[str, ...]) -> dict[str, Array]:
-    with allowed():
-        ends = run(scene)
+    ends = run(scene)
     return {state: ends[state].points for state in states}
 
 

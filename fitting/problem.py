@@ -14,7 +14,6 @@ from fitting.parameters import Parameters
 from fitting.targets import PointTarget, Target
 from jaxhair import Scene, State, check, run
 from jaxhair.checkpoints import Checkpoints
-from jaxhair.kernels import allowed
 from jaxhair.strands import strands_last
 
 States = dict[str, dict[str, Any]]
@@ -59,8 +58,7 @@ class Problem:
         self._last: tuple[bytes, Any] = (b"", None)
         self._journal: Checkpoints | None = None
         self._known: dict[bytes, Any] = {}
-        with allowed("derivatives"):  # as in `_residuals_and_jacobian`, which shares what is traced
-            shapes = jax.eval_shape(self.simulated, self.start, self.states)
+        shapes = jax.eval_shape(self.simulated, self.start, self.states)
         self.size = sum(s["residuals"].size for s in shapes.values())
         """Number of residuals that come from the data; the others are the prior's."""
 
@@ -135,12 +133,9 @@ class Problem:
         def residuals_at(free: Array) -> tuple[Array, States]:
             return self.residuals(free, targets)
 
-        def along(direction: Array) -> Any:
-            return jax.jvp(residuals_at, (free,), (direction,), has_aux=True)
-
-        with allowed("derivatives"):
-            directions = jnp.eye(free.size, dtype=free.dtype)
-            return jax.vmap(along, out_axes=(None, -1, None))(directions)
+        residuals, derivative, states = jax.linearize(residuals_at, free, has_aux=True)
+        directions = jnp.eye(free.size, dtype=free.dtype)
+        return residuals, jax.vmap(derivative, out_axes=-1)(directions), states
 
     def evaluate(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, States]:
         """Residuals, their Jacobian, shape (n, free numbers), and the states.

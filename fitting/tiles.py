@@ -15,7 +15,6 @@ from fitting.parameters import OWN_AXES, check_alike, check_free, unknown
 from fitting.processes import shared
 from fitting.targets import MM, Shape, Target
 from jaxhair import Scene, check, named_leaves, run
-from jaxhair.kernels import allowed
 from jaxhair.scene import matching
 from jaxhair.strands import strands_last
 
@@ -168,10 +167,7 @@ class Tiles:
         size = sum(p.size for p in self.parameters)
         x = np.zeros((size, self.tile), self.scene.dtype)
         try:
-            with (
-                allowed("derivatives"),
-                jax.numpy_rank_promotion("raise"),
-            ):  # where a leaf is no column, shapes get wrong
+            with jax.numpy_rank_promotion("raise"):  # where a leaf is no column, shapes get wrong
                 shapes = jax.eval_shape(self._simulated, x, self._tile(first))
         except (TypeError, ValueError) as error:
             columns = [p.name for p in self.parameters if p.column]
@@ -225,8 +221,7 @@ class Tiles:
             change = jnp.broadcast_to(direction[:, None], x.shape)
             return jax.jvp(residuals, (x,), (change,))
 
-        with allowed("derivatives"):
-            return jax.vmap(along, out_axes=(None, 0))(jnp.eye(x.shape[0], dtype=x.dtype))
+        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(x.shape[0], dtype=x.dtype))
 
     def _tiles(self, x: np.ndarray, strands: np.ndarray) -> Iterator[tuple[slice, Any]]:
         """Places of each tile's strands, and what was simulated; a few tiles are under way."""

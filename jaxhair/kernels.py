@@ -8,14 +8,11 @@ third of the time that it took without (`tests/benchmarks/peers.py`), and compil
 
 How: a call with the frontend attribute `xla_cpu_small_call`, which XLA gives to small loops by
 itself, is compiled as a single function. Not everything works inside; `_fits` knows what does.
-What does not fit is left as it was, and so are derivatives in reverse mode; other platforms; other
-versions of XLA than those tested; everything under the environment variable JAXHAIR_KERNELS=off;
-and whatever is not inside of `allowed`. XLA was seen to abort the process on some programs with
-kernels, such as gradients, or a loop that a user writes around a simulation: they are for programs
-that are the library's own from the outermost `jit` on, which its tests go through.
-
-A kernel's derivatives in forward mode are one too, of the values and the derivatives together: a
-Jacobian takes a third of the time that it took without.
+What does not fit is left as it was, and so are derivatives; other platforms; other versions of XLA
+than those tested; everything under the environment variable JAXHAIR_KERNELS=off; and whatever is
+not inside of `allowed`. XLA was seen to abort the process on some programs with kernels, such as a
+loop that a user writes around a simulation: they are for programs that are the library's own from
+the outermost `jit` on, which its tests go through.
 """
 
 import math
@@ -24,7 +21,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -67,25 +64,19 @@ def one_kernel(function: F) -> F:
     Values are those of the function, to rounding, and derivatives its own.
     """
 
-    def compiled() -> Callable[..., Any]:
-        @wraps(function)
-        def with_touched(*arguments: Any) -> Any:
-            return function(*arguments), _touched(arguments)
+    @wraps(function)
+    def with_touched(*arguments: Any) -> Any:
+        return function(*arguments), _touched(arguments)
 
-        return jax.jit(with_touched)
-
-    # what is traced keeps the marks of what it was traced for
-    values, derivatives = compiled(), compiled()
+    compiled = jax.jit(with_touched)
 
     @wraps(function)
     def called(*arguments: Any) -> Any:
         if not used():
             return function(*arguments)
-        marked = _allowed.get() == "derivatives"
-        results, touched = (derivatives if marked else values)(*arguments)
+        results, touched = compiled(*arguments)
         leaves, structure = jax.tree.flatten(results)
-        found = _results.bind(*leaves, *touched, count=len(leaves), derivatives=marked)
-        return jax.tree.unflatten(structure, found)
+        return jax.tree.unflatten(structure, _results.bind(*leaves, *touched, count=len(leaves)))
 
     return called  # type: ignore[return-value]
 
@@ -97,76 +88,45 @@ def _touched(arguments: Any) -> list[Array]:
     return [lax.slice(x, (0,) * x.ndim, (1,) * x.ndim) for x in arrays if x.size]
 
 
-Kernels = Literal["none", "values", "derivatives"]
-"""What a program has kernels for. With "derivatives" those in forward mode have them too, and there
-must be none in reverse mode."""
-
-_allowed: ContextVar[Kernels] = ContextVar("_allowed", default="none")
+_allowed = ContextVar("_allowed", default=False)
 
 
 @contextmanager
-def allowed(kernels: Kernels = "values") -> Iterator[None]:
+def allowed(yes: bool = True) -> Iterator[None]:
     """While a program is traced inside, functions are compiled as kernels."""
-    before = _allowed.set(kernels)
+    before = _allowed.set(yes)
     try:
         yield
     finally:
         _allowed.reset(before)
 
 
-def kernels_here() -> Kernels:
-    """What is allowed where this is called."""
-    return _allowed.get()
-
-
 def used() -> bool:
     """Whether functions are compiled as kernels here."""
-    on = _allowed.get() != "none" and os.environ.get("JAXHAIR_KERNELS", "on") != "off"
+    on = _allowed.get() and os.environ.get("JAXHAIR_KERNELS", "on") != "off"
     return on and jax.default_backend() == "cpu" and version.__version__ in TESTED
 
 
 # The results of a kernel, of those and its touched arguments. To lower it is to mark the call.
 _results = Primitive("results_of_kernel")
 _results.multiple_results = True
-_results.def_impl(lambda *x, count, derivatives: x[:count])
-_results.def_abstract_eval(lambda *x, count, derivatives: x[:count])
+_results.def_impl(lambda *x, count: x[:count])
+_results.def_abstract_eval(lambda *x, count: x[:count])
 
 
-def _jvp(primals: Any, tangents: Any, *, count: int, derivatives: bool) -> Any:
-    """Those of the results; marked, where they are to be, as further results of the kernel."""
-    if not derivatives:
-        return list(primals[:count]), list(tangents[:count])
-    moving = [not isinstance(t, ad.Zero) for t in tangents]
-    of_results = [t for t, moves in zip(tangents[:count], moving[:count], strict=True) if moves]
-    touched = [t for t, moves in zip(tangents[count:], moving[count:], strict=True) if moves]
-    found = iter(
-        _results.bind(
-            *primals[:count],
-            *of_results,
-            *primals[count:],
-            *touched,
-            count=count + len(of_results),
-            derivatives=True,
-        )
-    )
-    values = [next(found) for _ in range(count)]
-    return values, [
-        next(found) if moves else t
-        for t, moves in zip(tangents[:count], moving[:count], strict=True)
-    ]
+def _jvp(primals: Any, tangents: Any, *, count: int) -> Any:
+    return list(primals[:count]), list(tangents[:count])
 
 
-ad.primitive_jvps[_results] = _jvp
-batching.primitive_batchers[_results] = lambda x, axes, *, count, derivatives: (
-    _results.bind(*x, count=count, derivatives=derivatives),
+ad.primitive_jvps[_results] = _jvp  # derivatives are not marked
+batching.primitive_batchers[_results] = lambda x, axes, count: (
+    _results.bind(*x, count=count),
     axes[:count],
 )
-mlir.register_lowering(_results, lambda _, *x, count, derivatives: x[:count], cacheable=False)
+mlir.register_lowering(_results, lambda _, *x, count: x[:count], cacheable=False)
 
 
-def _mark(
-    context: mlir.LoweringRuleContext, *values: ir.Value[Any], count: int, derivatives: bool
-) -> Any:
+def _mark(context: mlir.LoweringRuleContext, *values: ir.Value[Any], count: int) -> Any:
     """Marks the call that made the values, if it fits into a kernel."""
     call = values[0].owner
     if isinstance(call, ir.Operation | ir.OpView) and call.operation.name == "func.call":

@@ -24,7 +24,7 @@ from jaxhair.effects import (
     of_kind,
 )
 from jaxhair.fibre import Fibre, PhysicalFibre, material, stiffness
-from jaxhair.kernels import Kernels, allowed, kernels_here, one_kernel
+from jaxhair.kernels import allowed, one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
@@ -265,7 +265,7 @@ def phase_end(
     *,
     steps: int,
     devices: int = 1,
-    kernels: Kernels = "none",
+    kernels: bool = False,
 ) -> State:
     """The state after a phase. Phases that differ only in numbers share the compiled program.
 
@@ -294,7 +294,7 @@ def run(scene: Scene, *, devices: int = 1) -> dict[str, State]:
     devices = tiles.checked_devices(scene, devices)
     scene = scene.as_arrays()
     state = start(scene)
-    kernels = kernels_here() if check.traced((scene, state)) else "values"
+    kernels = not check.traced((scene, state))
     bare = replace(scene, phases=())
     ends = {}
     for phase in scene.phases:

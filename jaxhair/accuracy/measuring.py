@@ -99,7 +99,7 @@ def _forward(scene: Scene) -> tuple[Callable[[], Any], int | None]:
     bare, first = replace(scene, phases=()), start(scene)
     state, programs = first, []
     for phase in scene.phases:
-        arguments = {"steps": phase.steps(scene.dt), "kernels": "values"}
+        arguments = {"steps": phase.steps(scene.dt), "kernels": True}
         program = phase_end.lower(bare, phase.effects, state, **arguments).compile()
         programs.append((program, phase.effects))
         if phase is not scene.phases[-1]:

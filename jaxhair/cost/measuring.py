@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -55,8 +54,7 @@ class PhaseCost:
         noise: how much the rest's time differed when it was measured twice [s]. Programs that
             do the same in another order differ by a little more.
         derivatives: of all the steps measured, over a step, in forward mode along one direction
-            (as fits take it) and in reverse mode in all numbers of the scene; empty where they were
-            not asked for.
+            and in reverse mode in all numbers of the scene; empty where they were not asked for.
     """
 
     phases: tuple[str, ...]
@@ -209,11 +207,11 @@ class _Bench:
         key = tree, tuple(np.shape(leaf) for leaf in leaves)
         if key not in self.programs:
             self.programs[key] = self.compiled(
-                phase_end.lower, variant, steps=self.steps, kernels="values"
+                phase_end.lower, variant, steps=self.steps, kernels=True
             )
         return self.programs[key]
 
-    def compiled(self, lower: Callable[..., Any], variant: Variant, **options: Any) -> _Program:
+    def compiled(self, lower: Callable[..., Any], variant: Variant, **options: int) -> _Program:
         begin = time.perf_counter()
         program = lower(variant.scene, variant.effects, self.state, **options).compile()
         taken = time.perf_counter() - begin
@@ -240,15 +238,14 @@ class _Bench:
     def derivatives(self, variant: Variant) -> dict[str, tuple[_Program, Variant]]:
         """Programs of the loop's derivatives, in forward and in reverse mode."""
 
+        def end(*arguments: Any) -> Any:
+            return phase_end(*arguments, steps=self.steps)
+
         def forward(*arguments: Any) -> Any:
-            end = partial(phase_end, steps=self.steps, kernels="derivatives")
             return jax.jvp(end, arguments, arguments)
 
         def reverse(*arguments: Any) -> Any:
-            def mean(*arguments: Any) -> Any:
-                return phase_end(*arguments, steps=self.steps).positions.mean()
-
-            return jax.grad(mean, argnums=(0, 1))(*arguments)
+            return jax.grad(lambda *x: end(*x).positions.mean(), argnums=(0, 1))(*arguments)
 
         return {
             name: (self.compiled(jax.jit(function).lower, variant), variant)

@@ -48,7 +48,7 @@ def stepping(built: jh.Scene, steps: int) -> Callable[[], Any]:
     """Some steps of a scene's last phase, compiled."""
     built = built.as_arrays()
     effects, bare, state = built.phases[-1].effects, replace(built, phases=()), start(built)
-    run = partial(phase_end, steps=steps, kernels="values")
+    run = partial(phase_end, steps=steps, kernels=True)
     program = jax.jit(run).lower(bare, effects, state).compile()
     return partial(program, bare, effects, state)
 

@@ -129,13 +129,13 @@ def in_scenes(repeats: int) -> None:
             taken = []
             free = tuple(e for e in phase.effects if not isinstance(e, jh.HairContact))
             for effects in (free, phase.effects):
-                run = partial(phase_end, bare, effects, state, steps=60, kernels="values")
+                run = partial(phase_end, bare, effects, state, steps=60, kernels=True)
                 taken.append(1e3 * min(wall_times(run, repeats)) / 60)
             made, skin = memory_after(prepare(bare, phase.effects), state, 60)
             print(f"  {name:<9} {phase.name:<12} {taken[0]:9.3f}   {taken[1]:12.3f}   "
                   f"{60 / made:12.1f}   {1e3 * skin:9.1f}", flush=True)  # fmt: skip
             steps = phase.steps(scene.dt)
-            state = phase_end(bare, phase.effects, state, steps=steps, kernels="values")
+            state = phase_end(bare, phase.effects, state, steps=steps, kernels=True)
 
 
 @partial(jax.jit, static_argnames="steps")

@@ -47,10 +47,7 @@ def step_time(scene: jh.Scene, phase: jh.Phase, steps: int) -> float:
     """Seconds a step in one phase of a scene."""
     scene = scene.as_arrays()
     bare, state = replace(scene, phases=()), start(scene)
-    return (
-        seconds(lambda: phase_end(bare, phase.effects, state, steps=steps, kernels="values"))
-        / steps
-    )
+    return seconds(lambda: phase_end(bare, phase.effects, state, steps=steps, kernels=True)) / steps
 
 
 def main() -> None:

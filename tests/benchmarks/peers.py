@@ -64,7 +64,7 @@ def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tup
     effects, state, bare = built.phases[0].effects, start(built), replace(built, phases=())
     steps = int(np.clip(400_000 / (strands * points), 20, 100))
     begin = time.perf_counter()
-    run = jax.jit(lambda *x: phase_end(*x, steps=steps, kernels="values"), compiler_options=options)
+    run = jax.jit(lambda *x: phase_end(*x, steps=steps, kernels=True), compiler_options=options)
     program = run.lower(bare, effects, state).compile()
     compilation = time.perf_counter() - begin
     return 1e6 * least(lambda: program(bare, effects, state)) / steps, compilation
@@ -81,7 +81,7 @@ def our_gradient(strands: int, points: int, solver: Any) -> tuple[float, float]:
         return jnp.sum(along * end.positions)
 
     gradient = jax.jit(jax.value_and_grad(loss))
-    forward = least(lambda: phase_end(bare, effects, state, steps=STEPS, kernels="values"))
+    forward = least(lambda: phase_end(bare, effects, state, steps=STEPS, kernels=True))
     return 1e6 * forward / STEPS, 1e6 * least(lambda: gradient(state.shapes)) / STEPS
 
 

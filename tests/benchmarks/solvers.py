@@ -52,7 +52,7 @@ def steps(strands: int, points: int, solver: Any, count: int) -> Callable[[], An
     scene = jh.Scene(hair(strands, points), jh.PhysicalFibre(), phases=(hang,), solver=solver)
     scene = scene.as_arrays()
     bare, state = replace(scene, phases=()), start(scene)
-    return lambda: phase_end(bare, scene.phases[0].effects, state, steps=count, kernels="values")
+    return lambda: phase_end(bare, scene.phases[0].effects, state, steps=count, kernels=True)
 
 
 def released(strands: int) -> tuple[Callable[[Any], Any], Any]:
