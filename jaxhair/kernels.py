@@ -12,7 +12,9 @@ What does not fit is left as it was, and so are derivatives; other platforms; ot
 than those tested; everything under the environment variable JAXHAIR_KERNELS=off; and whatever is
 not inside of `allowed`. XLA was seen to abort the process on some programs with kernels, such as a
 loop that a user writes around a simulation: they are for programs that are the library's own from
-the outermost `jit` on, which its tests go through.
+the outermost `jit` on, which its tests go through. Derivatives in forward mode were tried, too:
+Jacobians took a third to two thirds of the time, and one of 64 strands whose small functions alone
+were kernels ended the process ("All or none of the slices should have an explicit index").
 """
 
 import math

@@ -56,7 +56,10 @@ def steps(strands: int, points: int, solver: Any, count: int) -> Callable[[], An
 
 
 def released(strands: int) -> tuple[Callable[[Any], Any], Any]:
-    """The final shape of permed strands after 120 steps, by 5 numbers, and where to take it."""
+    """The final shape of permed strands after 120 steps, by 5 numbers, and where to take it.
+
+    Called outside of a `jit`, it has kernels, as a simulation has.
+    """
     rod, kinds = jh.Wound(20e-3, 0.1), {"hydrogen": 1.0, "ionic": 1.0, "disulfide": 1.0}
     phases = (
         jh.Phase("wound", AT_ONCE, (rod, jh.Cut(hydrogen=0.0, ionic=0.0, disulfide=0.8))),
@@ -91,11 +94,11 @@ def main() -> None:
     print("\nderivatives of a permed shape, 33 points, 120 steps: ratios to the forward run")
     for strands in (1, 64):
         shape, at = released(strands)
-        forward, jacobian = jax.jit(shape), jax.jit(jax.jacfwd(shape))
+        jacobian = jax.jit(jax.jacfwd(shape))
         gradient = jax.jit(jax.grad(lambda x, shape=shape: jnp.sum(shape(x) ** 2)))
         taken = in_turn(
             {
-                "forward": lambda f=forward, at=at: f(at),
+                "forward": lambda f=shape, at=at: f(at),
                 "Jacobian for 5 parameters": lambda f=jacobian, at=at: f(at),
                 "reverse-mode gradient": lambda f=gradient, at=at: f(at),
             },
