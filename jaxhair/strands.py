@@ -223,13 +223,14 @@ class Strands:
 def _framed(positions: Array, last: Array | None) -> tuple[Array, Array, Array, Array]:
     """Arrays of `Strands` through points; behind the `last` of each strand they repeat it."""
     if last is not None:
-        place = jnp.minimum(jnp.arange(positions.shape[1]), last[:, None])
+        places = jnp.arange(positions.shape[1], dtype=last.dtype)
+        place = jnp.minimum(places[None], last[:, None])
         positions = jnp.take_along_axis(positions, place[..., None], axis=1)
     x = strands_last(positions)
     edges = x[1:] - x[:-1]
     lengths, tangents = quat.safe_norm(edges), quat.unit(edges)
     if last is not None:  # missing edges go straight on, which keeps their frames unit
-        place = jnp.minimum(jnp.arange(len(edges))[:, None], last - 1)
+        place = jnp.minimum(places[: len(edges), None], last[None] - 1)
         tangents = jnp.take_along_axis(tangents, place[:, None], axis=0)
 
     def carried(q: Array, turn: Array) -> tuple[Array, Array]:
