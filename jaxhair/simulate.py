@@ -189,8 +189,7 @@ def prepare(scene: Scene, effects: tuple[Effect, ...], devices: int = 1) -> Setu
 
 def start(scene: Scene) -> State:
     """The state before the first step: at rest, every bond remembering the natural shape."""
-    forces = scene.solver.keeps_forces
-    return _start(scene.strands, scene.bonds.fraction, forces)
+    return _start(scene.strands, scene.bonds.fraction, scene.solver.keeps_forces)
 
 
 @partial(jax.jit, static_argnames="keeps_forces")

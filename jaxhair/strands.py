@@ -216,7 +216,7 @@ class Strands:
         return Strands(*_straight(roots, directions, length, points))
 
 
-# Compiled, each of these takes a tenth of a second the first time; operation by operation, three.
+# Compiled as one program each: half a second the first time; operation by operation, three.
 
 
 @jax.jit
