@@ -25,6 +25,7 @@ from jax import Array, lax
 from jaxhair import quaternion as quat
 from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree
+from jaxhair.stored import once
 
 
 @pytree
@@ -153,6 +154,7 @@ def _block(inverse_compliance: Array, g: Array, inverse: Array, n: Array, phi: A
     return _mv(g, phi) - _mv(inverse_compliance, n), phi
 
 
+@once
 def _inverse(a: Array) -> Array:
     """Inverse of a symmetric 3 x 3 matrix, by cofactors."""
     first, second, third = a[0], a[1], a[2]
@@ -166,7 +168,7 @@ def _inverse(a: Array) -> Array:
 # "t" is transposed.
 
 
-@one_kernel
+@once
 def matrix_product(a: Array, b: Array) -> Array:
     """a b."""
     return _over_three(lambda k: a[..., :, k, None, :] * b[..., None, k, :, :])
@@ -176,21 +178,21 @@ def _over_three(term: Callable[[int], Array]) -> Array:
     return term(0) + term(1) + term(2)
 
 
-@one_kernel
+@once
 def _tm(a: Array, b: Array) -> Array:
     return _over_three(lambda k: a[..., k, :, None, :] * b[..., k, None, :, :])
 
 
-@one_kernel
+@once
 def _mt(a: Array, b: Array) -> Array:
     return _over_three(lambda k: a[..., :, None, k, :] * b[..., None, :, k, :])
 
 
-@one_kernel
+@once
 def _mv(a: Array, v: Array) -> Array:
     return _over_three(lambda k: a[..., :, k, :] * v[..., k, None, :])
 
 
-@one_kernel
+@once
 def _tv(a: Array, v: Array) -> Array:
     return _over_three(lambda k: a[..., k, :, :] * v[..., k, None, :])

@@ -11,9 +11,9 @@ from jax import Array, lax
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import BondEffect
-from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree
 from jaxhair.rods import Rod
+from jaxhair.stored import once, stored
 from jaxhair.strands import BONDS, State
 
 TINY = 2.0**-60
@@ -58,7 +58,7 @@ def per_inner_point(x: Any) -> Array:
     return jnp.moveaxis(x, 0, -1)
 
 
-@one_kernel
+@once
 def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> Array:
     """Omega_o = sum_j f_j {Omega_j + (1 - b_j)(Omega - Omega_j)} / sum_j f_j (Eq. 15).
 
@@ -73,14 +73,15 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
     Returns Omega_o, shape (inner points, 3, strands).
     """
     share = influence / jnp.sum(influence, axis=1, keepdims=True)
+    r = stored(r)
     held = []
-    for j in range(len(BONDS)):
-        bent = present_shape(r, shapes[:, j]) - shapes[:, j]
-        held.append(share[:, j, None] * (shapes[:, j] + (1 - fractions[:, j, None]) * bent))
+    for shape, fraction, part in zip(*map(_of_kinds, (shapes, fractions, share)), strict=True):
+        bent = stored(present_shape(r, shape)) - shape
+        held.append(part[:, None] * (shape + (1 - fraction[:, None]) * bent))
     return sum(held[1:], held[0])
 
 
-@one_kernel
+@once
 def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, Array]:
     """(Eq. 15) as one spring: Omega - Omega_o = share (Omega - shape).
 
@@ -97,9 +98,16 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
     share = whole / jnp.sum(influence, axis=1, keepdims=True)
     cut = share <= _nothing(share)
     share = share - jnp.where(cut, lax.stop_gradient(share), 0)  # 0 if cut, with its slope
-    each = [bonded[:, j, None] * shapes[:, j] for j in range(len(BONDS))]
+    each = [
+        b[:, None] * shape for b, shape in zip(_of_kinds(bonded), _of_kinds(shapes), strict=True)
+    ]
     shape = sum(each[1:], each[0]) / jnp.where(cut, 1, whole)
     return quat.from_vector_part(shape), share
+
+
+def _of_kinds(x: Array) -> list[Array]:
+    """Of each kind its part of x, of shape (inner points, 4, ..., strands)."""
+    return [stored(jnp.squeeze(part, 1)) for part in lax.split(x, (1,) * len(BONDS), axis=1)]
 
 
 def _nothing(x: Array) -> float:
@@ -117,7 +125,7 @@ def present_shape(r: Array, remembered: Array) -> Array:
     return quat.same_hemisphere(r, quat.from_vector_part(remembered)) * r[..., 1:, :]
 
 
-@one_kernel
+@once
 def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
     """Omega_j <- (b_j Omega_j + db_j Omega) / (b_j + db_j) where db_j > 0 (Eq. 16).
 
@@ -172,10 +180,11 @@ def changes(
 def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
     """The state after its bonds re-formed and remember the present shape."""
     shapes, fractions = state.shapes, state.fractions
+    of_shapes, of_fractions = _of_kinds(shapes), _of_kinds(fractions)
     new, risen = {}, {}
     for j, rise in rises.items():
-        new[j] = remembered(shapes[:, j], fractions[:, j], rise, r)
-        risen[j] = fractions[:, j] + rise
+        new[j] = remembered(of_shapes[j], of_fractions[j], rise, r)
+        risen[j] = of_fractions[j] + rise
     return replace(state, shapes=_with_kinds(shapes, new), fractions=_with_kinds(fractions, risen))
 
 
@@ -183,8 +192,7 @@ def _with_kinds(x: Array, changed: dict[int, Array]) -> Array:
     """x, of shape (inner points, 4, ..., strands), with some kinds' values replaced."""
     if not changed:
         return x
-    kinds = range(len(BONDS))
-    return jnp.stack([changed[j] if j in changed else x[:, j] for j in kinds], axis=1)
+    return jnp.stack([changed.get(j, part) for j, part in enumerate(_of_kinds(x))], axis=1)
 
 
 class _Toward(BondEffect):

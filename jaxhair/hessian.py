@@ -63,7 +63,7 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
     shape, share = rest
     spring = share * rod.bending() / (unit.force * unit.length)
     spring, shape = rods.damped(rod, spring, shape, before, dt)
-    r = rods.darboux(q[:-1], q[1:])
+    r = rods.joints(q)
     r = quat.same_hemisphere(r, shape) * r
     moment = spring * (r - shape)[:, 1:]
     weakest = jnp.min(spring, axis=1, keepdims=True)

@@ -138,7 +138,7 @@ class Unloaded(PoseEffect):
         """
         free, share = springs(state.shapes, state.fractions, rod.influence)
         q = state.orientations
-        present = quat.relative(q[:-1], q[1:])
+        present = rods.joints(q)
         square = jnp.minimum(quat.dot(free[:, 1:], free[:, 1:]), 0.999)
         turn = jnp.concatenate([jnp.sqrt(1 - square), free[:, 1:]], axis=1)
         return _from_root(rod, state, jnp.where(share == 0, present, turn))

@@ -12,6 +12,20 @@ from jax import Array, lax
 from jaxhair.kernels import one_kernel
 
 
+def components(x: Array) -> list[Array]:
+    """The 3 or 4 components, each with an axis of size 1.
+
+    In reverse mode they are joined again, where slices of x would be padded with zeros and added
+    up.
+    """
+    return lax.split(x, (1,) * x.shape[-2], axis=x.ndim - 2)
+
+
+def joined(*parts: Array) -> Array:
+    """What `components` takes apart."""
+    return jnp.concatenate(parts, axis=-2)
+
+
 def dot(a: Array, b: Array) -> Array:
     """a . b over the component axis, which is kept with size 1."""
     return jnp.sum(a * b, axis=-2, keepdims=True)
@@ -24,9 +38,19 @@ def safe_norm(x: Array) -> Array:
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
 
 
+@jax.custom_jvp
 def unit(x: Array) -> Array:
     """x / |x| over the component axis; 0 where x = 0, with derivative 0 there."""
     return x * _inverse_norm(x)
+
+
+@unit.defjvp
+def _unit_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """d(x / |x|) = (dx - u (u . dx)) / |x|."""
+    (x,), (dx,) = primals, tangents
+    inverse = _inverse_norm(x)
+    u, turned = x * inverse, dx * inverse
+    return u, turned - u * dot(u, turned)
 
 
 @one_kernel
@@ -38,38 +62,32 @@ def _inverse_norm(x: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """a x b over the component axis."""
-    a1, a2, a3 = (a[..., i, :] for i in range(3))
-    b1, b2, b3 = (b[..., i, :] for i in range(3))
-    return jnp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=-2)
+    a1, a2, a3 = components(a)
+    b1, b2, b3 = components(b)
+    return joined(a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1)
 
 
 def multiply(a: Array, b: Array) -> Array:
     """Hamilton product a b: the rotation b followed by the rotation a."""
-    aw, ax, ay, az = (a[..., i, :] for i in range(4))
-    bw, bx, by, bz = (b[..., i, :] for i in range(4))
-    return jnp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-2,
+    aw, ax, ay, az = components(a)
+    bw, bx, by, bz = components(b)
+    return joined(
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
 
 
 def multiply_vector(q: Array, v: Array) -> Array:
     """Hamilton product q (0, v)."""
-    w, x, y, z = (q[..., i, :] for i in range(4))
-    a, b, c = (v[..., i, :] for i in range(3))
-    return jnp.stack(
-        [
-            -x * a - y * b - z * c,
-            w * a + y * c - z * b,
-            w * b - x * c + z * a,
-            w * c + x * b - y * a,
-        ],
-        axis=-2,
+    w, x, y, z = components(q)
+    a, b, c = components(v)
+    return joined(
+        -x * a - y * b - z * c,
+        w * a + y * c - z * b,
+        w * b - x * c + z * a,
+        w * c + x * b - y * a,
     )
 
 
@@ -80,35 +98,30 @@ def conjugate(q: Array) -> Array:
 
 def relative(q1: Array, q2: Array) -> Array:
     """conj(q1) q2: the rotation from the frame of q1 to the frame of q2, seen in q1."""
-    aw, ax, ay, az = (q1[..., i, :] for i in range(4))
-    bw, bx, by, bz = (q2[..., i, :] for i in range(4))
-    return jnp.stack(
-        [
-            aw * bw + ax * bx + ay * by + az * bz,
-            aw * bx - ax * bw - ay * bz + az * by,
-            aw * by + ax * bz - ay * bw - az * bx,
-            aw * bz - ax * by + ay * bx - az * bw,
-        ],
-        axis=-2,
+    aw, ax, ay, az = components(q1)
+    bw, bx, by, bz = components(q2)
+    return joined(
+        aw * bw + ax * bx + ay * by + az * bz,
+        aw * bx - ax * bw - ay * bz + az * by,
+        aw * by + ax * bz - ay * bw - az * bx,
+        aw * bz - ax * by + ay * bx - az * bw,
     )
 
 
 def tangent(q: Array) -> Array:
     """R(q) e3, the direction of an edge whose frame is q, with e3 = (0, 0, 1)."""
-    w, x, y, z = (q[..., i, :] for i in range(4))
-    return jnp.stack(
-        [2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], axis=-2
-    )
+    w, x, y, z = components(q)
+    return joined(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
 
 
 def axes(q: Array) -> tuple[Array, Array, Array]:
     """R(q) e1, R(q) e2 and R(q) e3, the columns of the rotation matrix of a unit quaternion."""
-    w, x, y, z = (q[..., i, :] for i in range(4))
+    w, x, y, z = components(q)
     columns = [
         [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
         [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
     ]
-    d1, d2 = (jnp.stack(column, axis=-2) for column in columns)
+    d1, d2 = (joined(*column) for column in columns)
     return d1, d2, tangent(q)
 
 
@@ -156,16 +169,13 @@ def perpendicular(a: Array) -> Array:
 
 def vector_multiply(v: Array, q: Array) -> Array:
     """Hamilton product (0, v) q."""
-    w, x, y, z = (q[..., i, :] for i in range(4))
-    a, b, c = (v[..., i, :] for i in range(3))
-    return jnp.stack(
-        [
-            -x * a - y * b - z * c,
-            w * a + b * z - c * y,
-            w * b + c * x - a * z,
-            w * c + a * y - b * x,
-        ],
-        axis=-2,
+    w, x, y, z = components(q)
+    a, b, c = components(v)
+    return joined(
+        -x * a - y * b - z * c,
+        w * a + b * z - c * y,
+        w * b + c * x - a * z,
+        w * c + a * y - b * x,
     )
 
 

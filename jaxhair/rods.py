@@ -13,6 +13,7 @@ from jax import Array
 from jaxhair import quaternion as quat
 from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
+from jaxhair.stored import once, stored
 
 
 @pytree
@@ -141,7 +142,7 @@ def stretch_shear_factors(
     )
 
 
-@one_kernel
+@once
 def stretch_shear_violation(p1: Array, p2: Array, q: Array, length: Array) -> Array:
     """C_s = gamma = (p2 - p1) / l - R(q) e3 (Eq. 1, Eq. 5)."""
     return (p2 - p1) / length - quat.tangent(q)
@@ -156,6 +157,7 @@ def stretch_shear(
         p1, p2: ends of an edge [m], shape (..., 3, strands). q: its frame, (..., 4, strands).
         length: l [m]. factors: of `stretch_shear_factors`.
     """
+    p1, p2, q = stored(p1), stored(p2), stored(q)
     gamma = stretch_shear_violation(p1, p2, q, length)
     return stretch_shear_moved(p1, p2, q, gamma, factors)
 
@@ -165,10 +167,10 @@ def stretch_shear_moved(
 ) -> tuple[Array, Array, Array]:
     """The corrections of `stretch_shear` for a given gamma."""
     g1, g2, gq = factors
-    w, x, y, z = (q[..., i, :] for i in range(4))
-    q_conj_e = jnp.stack([z, -y, x, -w], axis=-2)
+    w, x, y, z = quat.components(q)
+    q_conj_e = quat.joined(z, -y, x, -w)
     turn = quat.vector_multiply(gq * gamma, q_conj_e)
-    return p1 + g1 * gamma, p2 - g2 * gamma, quat.unit(q + turn)
+    return p1 + g1 * gamma, p2 - g2 * gamma, quat.unit(stored(q + turn))
 
 
 def bend_twist_factors(w1: Array, w2: Array, stiffness: Array) -> tuple[Array, Array]:
@@ -188,6 +190,11 @@ def darboux(q1: Array, q2: Array) -> Array:
     return quat.relative(q1, q2)
 
 
+def joints(q: Array) -> Array:
+    """`darboux` at each inner point of strands with frames q, shape (points - 1, 4, strands)."""
+    return stored(darboux(stored(q[:-1]), stored(q[1:])))
+
+
 def damped(rod: Rod, spring: Array, shape: Array, before: Array, dt: Any) -> tuple[Array, Array]:
     """The moment spring (Omega - shape) + spring (T / dt) (Omega - Omega_before) as one spring.
 
@@ -202,13 +209,13 @@ def damped(rod: Rod, spring: Array, shape: Array, before: Array, dt: Any) -> tup
     if time is None:
         return spring, shape
     rate = time / dt
-    old = darboux(before[:-1], before[1:])
+    old = joints(before)
     old = quat.same_hemisphere(old, shape) * old
     between = (shape + rate * old)[:, 1:] / (1 + rate)
     return spring * (1 + rate), quat.from_vector_part(between)
 
 
-@one_kernel
+@once
 def bend_twist_violation(r: Array, rest: Array) -> Array:
     """C_b = Omega - s Omega_o (Eq. 6), with s = +1 or -1, whichever is nearer (Eq. 7, Eq. 11).
 
@@ -232,6 +239,7 @@ def bend_twist(
         rest: the unit quaternion whose vector part is Omega_o, shape (..., 4, strands).
         factors: of `bend_twist_factors`.
     """
+    q1, q2 = stored(q1), stored(q2)
     c = bend_twist_violation(darboux(q1, q2), rest)
     return bend_twist_moved(q1, q2, c, factors)
 
@@ -241,6 +249,6 @@ def bend_twist_moved(
 ) -> tuple[Array, Array]:
     """The corrections of `bend_twist` for a given violation."""
     h1, h2 = factors
-    new1 = quat.unit(q1 + quat.multiply_vector(q2, h1 * c))
-    new2 = quat.unit(q2 - quat.multiply_vector(q1, h2 * c))
+    new1 = quat.unit(stored(q1 + quat.multiply_vector(q2, h1 * c)))
+    new2 = quat.unit(stored(q2 - quat.multiply_vector(q1, h2 * c)))
     return new1, new2

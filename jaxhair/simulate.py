@@ -74,8 +74,7 @@ def step(setup: Setup, state: State, time: Array) -> State:
         state, _ = lax.scan(substep, state, jnp.arange(n, dtype=state.positions.dtype))
     # 5. The bonds that re-form remember the present shape.
     if rises:
-        q = state.orientations
-        state = bond.reformed(state, rises, rods.darboux(q[:-1], q[1:]))
+        state = bond.reformed(state, rises, rods.joints(state.orientations))
     return state
 
 
@@ -131,7 +130,7 @@ def moved(
     if solver.compliant:
         rest = bond.springs(state.shapes, state.fractions, rod.influence)
     else:
-        r = rods.darboux(q[:-1], q[1:])
+        r = rods.joints(q)
         rest = from_vector_part(bond.rest_shape(state.shapes, state.fractions, rod.influence, r))
     # 4. Elasticity, and the velocity that follows from it.
     p, q, forces = solver.solve(rod, state, p, q, rest, dt)
