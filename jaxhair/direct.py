@@ -14,6 +14,7 @@ from jaxhair.hessian import Units, padded
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.solvers import Solver
+from jaxhair.stored import stored
 from jaxhair.strands import State
 
 
@@ -68,7 +69,7 @@ class Direct(Solver):
         for _ in range(self.newton_steps):
             known = Known(rod, rest, state.orientations, positions / unit.length, q, n)
             n, phi = newton_step(known, jnp.asarray(self.frame_inertia, q.dtype), dt)
-            q = quat.unit(quat.multiply(q, _rotation(phi)))
+            q = quat.unit(stored(quat.multiply(stored(q), stored(_rotation(phi)))))
         p = positions / unit.length + _moved(rod, n)
         return unit.length * _shortened(rod, unit, p, n), q, n * unit.force
 
@@ -151,7 +152,7 @@ def residual(known: Known, frame_inertia: Array, dt: Any, x: Pair) -> Pair:
     unit = Units.of(rod, dt)
     length = rod.lengths / unit.length
     p = known.positions + _moved(rod, n)
-    d1, d2, d3 = quat.axes(known.orientations)
+    d1, d2, d3 = (stored(d) for d in quat.axes(stored(known.orientations)))
     turned = d3 + d1 * phi[:, 1:2] - d2 * phi[:, :1]
     gap = p[1:] - p[:-1] - length * turned - length * unit.compliance * n
     bends = hessian.joints(rod, unit, known.before, known.orientations, known.rest, dt)
@@ -213,9 +214,10 @@ def _turned(rod: Rod, p: Array, change: Array, length: Array, q: Array) -> Array
     An edge shorter than half its rest length says less and less of its direction, and none of it
     where its points coincide: what is missing to the half is taken from the frame's own axis.
     """
-    axis = quat.tangent(q)
+    q = stored(q)
+    axis = stored(quat.tangent(q))
     across = change[1:] - change[:-1]
-    edge = p[1:] - p[:-1] + across - quat.dot(across, axis) * axis
+    edge = stored(p[1:] - p[:-1] + across - quat.dot(across, axis) * axis)
     missing = jnp.maximum(length / 2 - quat.safe_norm(edge), 0)
-    turn = quat.between(axis, quat.unit(edge + missing * axis))
-    return jnp.where(rod.edge_weights > 0, quat.unit(quat.multiply(turn, q)), q)
+    turn = quat.between(axis, stored(quat.unit(stored(edge + missing * axis))))
+    return jnp.where(rod.edge_weights > 0, quat.unit(stored(quat.multiply(stored(turn), q))), q)

@@ -18,6 +18,7 @@ from jaxhair import quaternion as quat
 from jaxhair import rods
 from jaxhair.block_tridiagonal import matrix_product
 from jaxhair.rods import Rod
+from jaxhair.stored import stored
 
 
 class Units(NamedTuple):
@@ -64,8 +65,8 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
     spring = share * rod.bending() / (unit.force * unit.length)
     spring, shape = rods.damped(rod, spring, shape, before, dt)
     r = rods.joints(q)
-    r = quat.same_hemisphere(r, shape) * r
-    moment = spring * (r - shape)[:, 1:]
+    r = stored(quat.same_hemisphere(r, shape) * r)
+    moment = stored(spring * (r - shape)[:, 1:])
     weakest = jnp.min(spring, axis=1, keepdims=True)
     bent = jnp.where(weakest > 0, quat.dot(moment, moment) / jnp.where(weakest > 0, weakest, 1), 0)
     rounding = 32 * np.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)

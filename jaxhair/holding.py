@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxhair import check
+from jaxhair import check, rods
 from jaxhair import quaternion as quat
 from jaxhair.bonds import springs
 from jaxhair.effects import HoldingEffect, PoseEffect

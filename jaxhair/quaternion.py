@@ -4,15 +4,18 @@ Vectors have shape (..., 3, strands). A quaternion and its negative are the same
 All functions work in any floating dtype and are safe in value and derivative at zero.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from jaxhair.kernels import one_kernel
+from jaxhair.stored import stored
 
 
-def components(x: Array) -> list[Array]:
+def components(x: Array) -> Sequence[Array]:
     """The 3 or 4 components, each with an axis of size 1.
 
     In reverse mode they are joined again, where slices of x would be padded with zeros and added
@@ -157,13 +160,15 @@ def between(a: Array, b: Array) -> Array:
     opposite = w < np.finfo(a.dtype).eps / 2  # nearer, rounding would choose the axis
     q = jnp.concatenate([w, cross(a, b)], axis=-2)
     half_turn = jnp.concatenate([jnp.zeros_like(w), perpendicular(a)], axis=-2)
-    return unit(jnp.where(opposite, half_turn, q))
+    return unit(stored(jnp.where(opposite, half_turn, q)))
 
 
 def perpendicular(a: Array) -> Array:
     """Some unit vector perpendicular to a."""
-    smallest = jnp.argmin(jnp.abs(a), axis=-2)
-    helper = jnp.moveaxis(jax.nn.one_hot(smallest, 3, dtype=a.dtype), -1, -2)
+    x, y, z = components(jnp.abs(a))
+    first = (x <= y) & (x <= z)  # the smallest one, without `argmin`, which is slow
+    second = ~first & (y <= z)
+    helper = joined(first, second, ~(first | second)).astype(a.dtype)
     return unit(cross(a, helper))
 
 

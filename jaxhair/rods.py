@@ -157,7 +157,6 @@ def stretch_shear(
         p1, p2: ends of an edge [m], shape (..., 3, strands). q: its frame, (..., 4, strands).
         length: l [m]. factors: of `stretch_shear_factors`.
     """
-    p1, p2, q = stored(p1), stored(p2), stored(q)
     gamma = stretch_shear_violation(p1, p2, q, length)
     return stretch_shear_moved(p1, p2, q, gamma, factors)
 
@@ -239,7 +238,6 @@ def bend_twist(
         rest: the unit quaternion whose vector part is Omega_o, shape (..., 4, strands).
         factors: of `bend_twist_factors`.
     """
-    q1, q2 = stored(q1), stored(q2)
     c = bend_twist_violation(darboux(q1, q2), rest)
     return bend_twist_moved(q1, q2, c, factors)
 

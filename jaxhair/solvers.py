@@ -16,6 +16,7 @@ from jaxhair import check, rods
 from jaxhair.kernels import one_kernel
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
+from jaxhair.stored import stored
 from jaxhair.strands import State
 
 SWEEPS = ("red-black", "sequential")
@@ -80,9 +81,9 @@ class _Sweeping(Solver):
         check.positive("solver.orientation_weight", self.orientation_weight)
         check.whole("solver.substeps", self.substeps, least=1, most=100_000)
 
-    def _swept(self, *arguments: Any) -> tuple[Array, Array]:
+    def _swept(self, edge: Any, inner: Any, *arguments: Any) -> tuple[Array, Array]:
         sweep = _red_black if self.sweep == "red-black" else _sequential
-        return sweep(self.iterations, *arguments)
+        return sweep(self.iterations, _of_stored(edge), _of_stored(inner), *arguments)
 
     def _weights(self, rod: Rod) -> tuple[Array, Array]:
         """Lengths without zeros, and w_q of the edges' frames."""
@@ -196,6 +197,11 @@ def _relative_springs(rod: Rod, dt: float) -> Array:
 # Sweeps. `edge` and `inner` project a constraint: they take the two things it joins (and the
 # frame between two points), its multiplier or None, and its constants, and return what they took,
 # moved. `m` are the multipliers of edges and of inner points, `at` their constants.
+
+
+def _of_stored(project: Callable[..., Any]) -> Callable[..., Any]:
+    """A projection whose arguments, but for its constants, are stored."""
+    return lambda *x: project(*jax.tree.map(stored, x[:-1]), x[-1])
 
 
 def _repeat(iteration: Callable[[Any, Any], Any], x: Any, at: Any, times: int) -> Any:
