@@ -1,6 +1,6 @@
 """Side-chain bonds: the rest shape they make, what they remember, how they break and re-form."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -75,9 +75,11 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
     share = influence / jnp.sum(influence, axis=1, keepdims=True)
     r = stored(r)
     held = []
-    for shape, fraction, part in zip(*map(_of_kinds, (shapes, fractions, share)), strict=True):
-        bent = stored(present_shape(r, shape)) - shape
-        held.append(part[:, None] * (shape + (1 - fraction[:, None]) * bent))
+    shape, fraction, part = map(_of_kind, (shapes, fractions, share))
+    for j in range(len(BONDS)):
+        kept, cut = shape(j), 1 - fraction(j)[:, None]
+        bent = stored(present_shape(r, kept)) - kept
+        held.append(part(j)[:, None] * (kept + cut * bent))
     return sum(held[1:], held[0])
 
 
@@ -98,16 +100,16 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
     share = whole / jnp.sum(influence, axis=1, keepdims=True)
     cut = share <= _nothing(share)
     share = share - jnp.where(cut, lax.stop_gradient(share), 0)  # 0 if cut, with its slope
-    each = [
-        b[:, None] * shape for b, shape in zip(_of_kinds(bonded), _of_kinds(shapes), strict=True)
-    ]
+    part, one = _of_kind(bonded), _of_kind(shapes)
+    each = [part(j)[:, None] * one(j) for j in range(len(BONDS))]
     shape = sum(each[1:], each[0]) / jnp.where(cut, 1, whole)
     return quat.from_vector_part(shape), share
 
 
-def _of_kinds(x: Array) -> list[Array]:
-    """Of each kind its part of x, of shape (inner points, 4, ..., strands)."""
-    return [stored(jnp.squeeze(part, 1)) for part in lax.split(x, (1,) * len(BONDS), axis=1)]
+def _of_kind(x: Array) -> Callable[[int], Array]:
+    """Each kind's part of x, of shape (inner points, 4, ..., strands), by its place in `BONDS`."""
+    parts = lax.split(x, (1,) * len(BONDS), axis=1)
+    return lambda j: stored(jnp.squeeze(parts[j], 1))
 
 
 def _nothing(x: Array) -> float:
@@ -180,11 +182,11 @@ def changes(
 def reformed(state: State, rises: dict[int, Array], r: Array) -> State:
     """The state after its bonds re-formed and remember the present shape."""
     shapes, fractions = state.shapes, state.fractions
-    of_shapes, of_fractions = _of_kinds(shapes), _of_kinds(fractions)
+    shape, fraction = _of_kind(shapes), _of_kind(fractions)
     new, risen = {}, {}
     for j, rise in rises.items():
-        new[j] = remembered(of_shapes[j], of_fractions[j], rise, r)
-        risen[j] = of_fractions[j] + rise
+        new[j] = remembered(shape(j), fraction(j), rise, r)
+        risen[j] = fraction(j) + rise
     return replace(state, shapes=_with_kinds(shapes, new), fractions=_with_kinds(fractions, risen))
 
 
@@ -192,7 +194,9 @@ def _with_kinds(x: Array, changed: dict[int, Array]) -> Array:
     """x, of shape (inner points, 4, ..., strands), with some kinds' values replaced."""
     if not changed:
         return x
-    return jnp.stack([changed.get(j, part) for j, part in enumerate(_of_kinds(x))], axis=1)
+    part = _of_kind(x)
+    kinds = range(len(BONDS))
+    return jnp.stack([changed[j] if j in changed else part(j) for j in kinds], axis=1)
 
 
 class _Toward(BondEffect):
