@@ -14,6 +14,7 @@ from jaxhair.effects import RememberingEffect
 from jaxhair.neighbours import batch_here, near_pairs
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
+from jaxhair.stored import stored
 from jaxhair.strands import State
 
 FULL = 0.8
@@ -98,27 +99,27 @@ class HairContact(RememberingEffect):
         def with_chunk(total: tuple[Array, ...], pairs: tuple[Array, Array]) -> tuple[Any, None]:
             at, edge = pairs
             p, start, end = (x.at[:, n].get(mode="clip") for n in (at, edge, edge + strands))
-            push = jnp.where(at < size, self._push(p, start, end), 0)
+            push = quat.components(stored(jnp.where(at < size, self._push(p, start, end), 0)))
             return tuple(
-                t.at[at].add(one, mode="drop") for t, one in zip(total, push, strict=True)
+                t.at[at].add(one[0], mode="drop") for t, one in zip(total, push, strict=True)
             ), None
 
         body = jax.checkpoint(with_chunk, prevent_cse=False)
         total, _ = lax.scan(body, (jnp.zeros_like(x[0]),) * 3, (memory.points, memory.edges))
         holds = memory.hold(lax.stop_gradient(state.positions))
-        pushed = self.strength * dt * jnp.where(holds, jnp.stack(total), jnp.nan)
+        pushed = self.strength * dt * jnp.where(holds, stored(jnp.stack(total)), jnp.nan)
         pushed = jnp.moveaxis(pushed.reshape(3, -1, strands), 0, 1)
         return pushed if self.in_gradients else lax.stop_gradient(pushed)
 
     def _push(self, p: Array, start: Array, end: Array) -> Array:
         """(2r - D) / (2r) n of points from edges, each of shape (3, pairs)."""
-        along = end - start
-        square = quat.dot(along, along)
-        place = jnp.clip(quat.dot(p - start, along) / jnp.where(square == 0, 1, square), 0, 1)
-        apart = (p - start) - place * along  # of small numbers: where hair is has no rounding here
         rounding = 4 * np.finfo(p.dtype).eps * jnp.max(jnp.abs(p), axis=-2, keepdims=True)
+        along, p = stored(end - start), stored(p - start)
+        square = quat.dot(along, along)
+        place = jnp.clip(quat.dot(p, along) / jnp.where(square == 0, 1, square), 0, 1)
+        apart = stored(p - place * along)  # of small numbers: where hair is has no rounding here
         nowhere = jnp.all(jnp.abs(apart) <= rounding, axis=-2, keepdims=True)  # NaN is not
-        apart = jnp.where(nowhere, 0, apart)
+        apart = stored(jnp.where(nowhere, 0, apart))
         depth = jnp.maximum(1 - quat.safe_norm(apart) / (2 * self.radius), 0)
         return depth * quat.unit(apart)
 

@@ -30,6 +30,7 @@ from jaxhair.quaternion import from_vector_part
 from jaxhair.rods import Rod
 from jaxhair.scene import Scene
 from jaxhair.solvers import Solver
+from jaxhair.stored import stored
 from jaxhair.strands import State, Strands, strands_last
 
 
@@ -58,7 +59,7 @@ def step(setup: Setup, state: State, time: Array) -> State:
     rod, effects, dt = setup.rod, setup.effects, setup.dt
     # 1. External forces, and the bonds that break. 2a. Interactions that change velocities.
     fractions, rises = bond.changes(of_kind(effects, BondEffect), rod, state, dt)
-    change = [e.velocity_change(rod, state, dt) for e in of_kind(effects, VelocityEffect)]
+    change = [stored(e.velocity_change(rod, state, dt)) for e in of_kind(effects, VelocityEffect)]
     state = replace(state, fractions=fractions)
     if of_kind(effects, PoseEffect):
         state = posed(setup, state)
@@ -122,9 +123,9 @@ def moved(
     # 2b. Prediction; held points move; obstacles.
     p = p + jnp.where(rod.point_weights > 0, dt * v, 0)
     for holding in of_kind(effects, HoldingEffect):
-        p, q = holding.moved(rod, p, q, time, dt)
+        p, q = jax.tree.map(stored, holding.moved(rod, p, q, time, dt))
     for obstacle in of_kind(effects, PositionEffect):
-        p = obstacle.projected(rod, p, state.positions, time, dt)
+        p = stored(obstacle.projected(rod, p, state.positions, time, dt))
     # 3. The rest shape that the bonds make.
     rest: Any
     if solver.compliant:
