@@ -186,4 +186,4 @@ def _matrix(w: Array, v: Array) -> Array:
 
 def padded(x: Array, before: int, after: int) -> Array:
     """Rows of zeros before and after."""
-    return jnp.pad(x, ((before, after), *((0, 0),) * (x.ndim - 1)))
+    return jnp.pad(stored(x), ((before, after), *((0, 0),) * (x.ndim - 1)))
