@@ -2,7 +2,7 @@
 
 XLA's CPU compiler joins operations into loops, and gives each element of a loop all that it needs,
 computed again: one of a product of quaternions needs all of both. Through products of products, as
-derivatives are, that made gradients take three to five times as long (`tests/benchmarks/peers.py`).
+derivatives are, that made gradients take 1.6 to 4 times as long (`tests/benchmarks/peers.py`).
 `stored` ends a loop. How: a call of a function that returns its argument, marked as not to be
 inlined. XLA's own barrier, `lax.optimization_barrier`, is gone before loops are joined.
 """

@@ -18,7 +18,7 @@ from jaxhair import tiles
 from jaxhair.kernels import allowed
 from jaxhair.simulate import advance, prepare, start
 
-SIZES = ((200, 9), (10_000, 9), (10_000, 16), (1_000, 100))
+SIZES = ((200, 9), (100, 17), (10_000, 9), (10_000, 16), (1_000, 100))
 STRANDS = (100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POINTS = (5, 9, 17, 33, 65, 129, 257, 500)
 EFFECTS = (jh.Gravity(), jh.Drag(2.8), jh.Hold())
