@@ -28,12 +28,14 @@ class Solver:
     compliant: it takes bonds as springs, `jaxhair.bonds.springs`, and needs a physical fibre;
         otherwise it takes the rest shape of (Eq. 15) and works with both kinds of fibre.
     keeps_forces: the forces in the edges are part of the state.
+    recomputes: in reverse mode it computes its iterations again, so that a step stores little.
     substeps: how often in a time step the strands are predicted and solved, each time over
         dt / substeps; external forces, contact and bonds are computed once a step.
     """
 
     compliant: ClassVar[bool]
     keeps_forces: ClassVar[bool] = False
+    recomputes: ClassVar[bool] = False
     substeps: int
 
     @abstractmethod
@@ -70,6 +72,7 @@ def stiffness_per_iteration(stiffness: Array, iterations: int) -> Array:
 class _Sweeping(Solver):
     """Gauss-Seidel: constraints are projected one after another, several times over."""
 
+    recomputes: ClassVar[bool] = True
     iterations: int = static(default=5)
     sweep: str = static(default="red-black")
     orientation_weight: Any = 0.03
