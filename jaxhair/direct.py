@@ -49,6 +49,11 @@ class Direct(Solver):
     compliant: ClassVar[bool] = True
     keeps_forces: ClassVar[bool] = True
 
+    @property
+    def numbers(self) -> int:
+        """Nine of a matrix."""
+        return 9
+
     def __post_init__(self) -> None:
         check.whole("solver.newton_steps", self.newton_steps, least=1, most=100)
         check.positive("solver.frame_inertia", self.frame_inertia)

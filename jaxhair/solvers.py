@@ -38,6 +38,11 @@ class Solver:
     recomputes: ClassVar[bool] = False
     substeps: int
 
+    @property
+    def numbers(self) -> int:
+        """Of a point, in the largest array of the loops that are compiled as kernels; 0: none."""
+        return 0
+
     @abstractmethod
     def solve(
         self, rod: Rod, state: State, positions: Array, orientations: Array, rest: Any, dt: float
@@ -83,6 +88,11 @@ class _Sweeping(Solver):
         check.choice("solver.sweep", self.sweep, SWEEPS)
         check.positive("solver.orientation_weight", self.orientation_weight)
         check.whole("solver.substeps", self.substeps, least=1, most=100_000)
+
+    @property
+    def numbers(self) -> int:
+        """Four of a quaternion, and half of them where even and odd edges have their own."""
+        return 2 if self.sweep == "red-black" else 4
 
     def _swept(self, edge: Any, inner: Any, *arguments: Any) -> tuple[Array, Array]:
         sweep = _red_black if self.sweep == "red-black" else _sequential

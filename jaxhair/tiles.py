@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxhair import check
 from jaxhair.effects import Effect
-from jaxhair.kernels import LARGEST
+from jaxhair.kernels import LARGEST, used
 
 if TYPE_CHECKING:
     from jaxhair.scene import Scene
@@ -27,7 +27,7 @@ LANES = 16
 
 FEWEST, MOST, POINTS = 64, 128, 9600
 """Strands of a tile, and their points. More do not stay in cache; fewer waste time on starting
-kernels. Measured: see `tests/benchmarks/devices.py`."""
+what XLA makes of a step. Measured: see `tests/benchmarks/devices.py`."""
 
 
 def couples(effects: Iterable[Effect]) -> Effect | None:
@@ -63,14 +63,20 @@ def checked_devices(scene: "Scene", devices: int) -> int:
     return devices
 
 
-def tiling(strands: int, points: int) -> tuple[int, int]:
+def tiling(strands: int, points: int, numbers: int = 0) -> tuple[int, int]:
     """How many tiles, and strands in each, of which the last repeats some.
 
     One where the largest arrays, of remembered shapes, fit into one kernel, and where a tile's
     strands would be too few because they are long.
+
+    numbers: of a point in the largest array of a solver's kernels, which take 1.5 to 3 times as
+        long where they do not fit; 0 where there are no kernels.
     """
-    most = min(POINTS // points // LANES * LANES, MOST)
-    if strands * 12 * points <= LARGEST or most < FEWEST:
+    most, fewest = POINTS // points // LANES * LANES, FEWEST
+    if numbers and (fitting := LARGEST // (numbers * points) // LANES * LANES):
+        most, fewest = fitting, LANES
+    most = min(most, MOST)
+    if strands * 12 * points <= LARGEST or strands <= most or most < fewest:
         return 1, strands
     tiles = -(-strands // most)
     return tiles, -(-strands // (LANES * tiles)) * LANES
@@ -131,7 +137,7 @@ def _by_tiles(
     advanced: Callable[..., "State"], setup: "Setup", state: "State", *shared: Array
 ) -> "State":
     points, _, strands = state.positions.shape
-    tiles, lanes = tiling(strands, points)
+    tiles, lanes = tiling(strands, points, setup.solver.numbers if used() else 0)
     if tiles == 1 or jax.default_backend() != "cpu":
         return advanced(setup, state, *shared)
     leaves, tree, own = _flat((setup, state, *shared), strands)

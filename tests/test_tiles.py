@@ -164,9 +164,14 @@ def test_what_may_couple_strands_is_simulated_whole(effect: Any) -> None:
 
 
 @pytest.mark.parametrize("points", [2, 9, 33, 100, 150, 500])
-def test_tiles_hold_all_strands_and_no_more_than_one_is_filled_up(points: int) -> None:
+@pytest.mark.parametrize("numbers", [0, 2, 4, 9])
+def test_tiles_hold_all_strands_and_no_more_than_one_is_filled_up(
+    points: int, numbers: int
+) -> None:
     for strands in (1, 16, 200, 257, 1000, 10_000):
-        number, lanes = tiles.tiling(strands, points)
+        number, lanes = tiles.tiling(strands, points, numbers)
+        if numbers * points * tiles.LANES <= tiles.LARGEST:
+            assert numbers * points * lanes <= tiles.LARGEST
         if number == 1:
             assert lanes == strands
         else:
