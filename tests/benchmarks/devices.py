@@ -35,7 +35,7 @@ def steps(strands: int, points: int, devices: int, whole: bool) -> tuple[Callabl
     def end(scene: jh.Scene) -> Any:
         return advance(prepare(scene, EFFECTS, devices), start(scene), 0, steps=number)
 
-    tiling = (lambda strands, points: (1, strands)) if whole else tiles.tiling
+    tiling = (lambda strands, *_: (1, strands)) if whole else tiles.tiling
     with mock.patch.object(tiles, "tiling", tiling), allowed():
         compiled = jax.jit(end).lower(scene).compile()
     if devices > 1:  # where the program wants them
