@@ -133,7 +133,8 @@ def test_contact_may_be_left_out_of_gradients() -> None:
         *(jax.value_and_grad(partial(end, in_gradients=b))(20.0) for b in (True, False)),
         strict=True,
     )
-    assert values[0] == values[1] > 1e-3
+    assert end(20.0, True) == end(20.0, False) > 1e-3
+    np.testing.assert_allclose(values, end(20.0, True), rtol=1e-12)  # as another program rounds
     assert slopes[0] > 1e-9
     assert slopes[1] == 0
 
