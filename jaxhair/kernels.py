@@ -58,6 +58,7 @@ INSIDE = frozenset(
 """Operations known to work: no sorting, scattering, gathering, matrix products or library calls."""
 
 _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+_FRONTEND = "mhlo.frontend_attributes"
 
 
 def one_kernel(function: F) -> F:
@@ -128,22 +129,23 @@ batching.primitive_batchers[_results] = lambda x, axes, count: (
 mlir.register_lowering(_results, lambda _, *x, count: x[:count], cacheable=False)
 
 
-def _mark(context: mlir.LoweringRuleContext, *values: ir.Value[Any], count: int) -> Any:
+def mark(call: Any, attributes: dict[str, str]) -> None:
+    """Gives a call of a lowered program the attributes that XLA's CPU compiler reads."""
+    marks: dict[str, ir.Attribute] = {n: ir.StringAttr.get(x) for n, x in attributes.items()}
+    call.operation.attributes[_FRONTEND] = ir.DictAttr.get(marks)
+
+
+def _marked(context: mlir.LoweringRuleContext, *values: ir.Value[Any], count: int) -> Any:
     """Marks the call that made the values, if it fits into a kernel."""
     call = values[0].owner
     if isinstance(call, ir.Operation | ir.OpView) and call.operation.name == "func.call":
-        attributes = call.operation.attributes
-        if "mhlo.frontend_attributes" not in attributes and _fits(
-            context.module_context, call, True
-        ):
-            marks: dict[str, ir.Attribute] = {
-                n: ir.StringAttr.get(x) for n, x in _ATTRIBUTES.items()
-            }
-            attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(marks)
+        unmarked = _FRONTEND not in call.operation.attributes
+        if unmarked and _fits(context.module_context, call, True):
+            mark(call, _ATTRIBUTES)
     return values[:count]
 
 
-mlir.register_lowering(_results, _mark, platform="cpu", cacheable=False)
+mlir.register_lowering(_results, _marked, platform="cpu", cacheable=False)
 
 
 def _fits(module: mlir.ModuleContext, call: Any, touched: bool = False) -> bool:

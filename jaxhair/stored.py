@@ -71,8 +71,7 @@ def _called(context: mlir.LoweringRuleContext, x: ir.Value[Any]) -> Any:
     with ir.InsertionPoint(block):
         func.ReturnOp(block.arguments)
     call = func.CallOp([x.type], ir.FlatSymbolRefAttr.get(name.value), [x])
-    mark: dict[str, ir.Attribute] = {"inlineable": ir.StringAttr.get("false")}
-    call.operation.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(mark)
+    kernels.mark(call, {"inlineable": "false"})
     return call.results
 
 
