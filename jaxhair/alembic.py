@@ -66,7 +66,7 @@ def write(
 
     Raises ValueError for a recording without frames, and FileExistsError.
     """
-    check.choice("basis", basis, BASES)
+    check.choice("basis", basis, tuple(BASES))
     if len(recording.phases) == 0:
         raise ValueError("recording has 0 frames; it must have at least 1")
     positions = np.asarray(recording.positions)
@@ -124,7 +124,8 @@ def _hair(
         sampling: the place of that of the frames.
     """
     frames, strands = len(points), len(counts)
-    box = boxes(points, counts, float(widths.max())) if strands else np.zeros((frames, 2, 3))
+    inner = inside(points, counts)
+    box = _boxes(points, inner, counts, widths, basis)
     basis_and_type = np.array(BASES[basis], "u1")
     curves = (
         Property(
@@ -136,7 +137,7 @@ def _hair(
         ),
         Property(
             "P",
-            inside(points, counts),
+            inner,
             sampling=sampling,
             metadata="geoScope=vtx;interpretation=point",
         ),
@@ -170,13 +171,26 @@ def _hair(
     )
 
 
+def _boxes(
+    points: np.ndarray, inner: np.ndarray, counts: np.ndarray, widths: np.ndarray, basis: str
+) -> np.ndarray:
+    """Of each frame, shape (frames, 2, 3)."""
+    if len(counts) == 0:
+        return np.zeros((len(points), 2, 3))
+    width = float(widths.max())
+    if basis == "linear":
+        half = np.array([[-width / 2], [width / 2]])
+        return np.stack([inner.min(1), inner.max(1)], 1).astype(float) + half
+    return boxes(points.astype(float), counts, width)
+
+
 def _compound(name: str, *properties: Property, metadata: str = "") -> Property:
     return Property(name, metadata=metadata, compound=properties)
 
 
 def _parameter(
     name: str,
-    samples: Sequence[Any],
+    samples: Sequence[Any] | np.ndarray,
     scope: str = "vtx",
     *,
     sampling: int = 0,

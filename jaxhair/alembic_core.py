@@ -51,7 +51,7 @@ class Property:
     """
 
     name: str
-    samples: Sequence[Any] = ()
+    samples: Sequence[Any] | NDArray[Any] = ()
     scalar: bool = False
     sampling: int = 0
     metadata: str = ""
@@ -128,7 +128,8 @@ class _Archive:
 
     def _property(self, of: Property) -> tuple[int, bytes, bytes]:
         """Reference, header and digest."""
-        info, numbers = 0, []
+        info = 0
+        numbers: list[int] = []
         if of.compound is not None:
             group, digest = self._compound(of.compound)
         else:
