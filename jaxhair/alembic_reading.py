@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxhair import check
+from jaxhair.alembic_core import TYPES
 from jaxhair.alembic_headers import Header
 from jaxhair.alembic_tree import Archive, Object
 from jaxhair.usd_child import on_curve
@@ -60,8 +61,7 @@ def read(data: bytes, frame: int) -> tuple[NDArray[Any], NDArray[np.int64]]:
     for i in needed:
         parent = objects[i].parent
         try:
-            shown = archive.sample(tops[i], "visible", "i1", 1, time)
-            visible[i] = visible[parent] and (shown is None or not np.any(shown == 0))
+            visible[i] = visible[parent] and not _hidden(archive, tops[i], time)
             if not _is_curves(objects[i]):
                 places[i] = _matrix(archive, inner[i], time, places[parent])
                 continue
@@ -79,6 +79,14 @@ def read(data: bytes, frame: int) -> tuple[NDArray[Any], NDArray[np.int64]]:
 
 def _is_curves(of: Object) -> bool:
     return of.schema.startswith(CURVES)
+
+
+def _hidden(archive: Archive, properties: Properties, time: float) -> bool:
+    header = properties.get("visible")
+    if header is None or header.type != TYPES.index("i1"):  # another program's own property
+        return False
+    shown = archive.sample(properties, "visible", "i1", header.extent, time)
+    return shown is not None and bool(np.any(shown == 0))
 
 
 def _path(objects: Sequence[Object], i: int) -> str:

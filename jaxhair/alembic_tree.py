@@ -57,7 +57,9 @@ class Archive:
         layout, _, top, _, samplings, metadata = (int(each) for each in root)
         number = bytes(self._container.data(layout))
         if number != struct.pack("<i", FORMAT):
-            raise ValueError(f"the version of its layout is {number!r}; it must be {FORMAT}")
+            raise ValueError(
+                f"the version of its layout is {number[:4]!r}; it must be {FORMAT} as int32"
+            )
         self._top = top
         self._samplings = read_samplings(self._cursor(samplings, "time samplings"))
         self._metadata = read_indexed(self._cursor(metadata, "indexed metadata"))
