@@ -57,13 +57,14 @@ def read(data: bytes, frame: int) -> tuple[NDArray[Any], NDArray[np.int64]]:
     time = _time(archive, objects, inner, frame)
     points, counts = [np.zeros((0, 3), "<f4")], [np.zeros(0, np.int64)]
     places: dict[int, NDArray[np.float64]] = {-1: np.eye(4)}
+    known: dict[tuple[bytes, bytes], NDArray[np.float64]] = {}  # of transforms that are the same
     visible = {-1: True}
     for i in needed:
         parent = objects[i].parent
         try:
             visible[i] = visible[parent] and not _hidden(archive, tops[i], time)
             if not _is_curves(objects[i]):
-                places[i] = _matrix(archive, inner[i], time, places[parent])
+                places[i] = _matrix(archive, inner[i], time, places[parent], known)
                 continue
             places[i] = places[parent]
             if visible[i]:
@@ -179,9 +180,16 @@ def _name(names: Sequence[str], number: int) -> str:
 
 
 def _matrix(
-    archive: Archive, properties: Properties, time: float, parent: NDArray[np.float64]
+    archive: Archive,
+    properties: Properties,
+    time: float,
+    parent: NDArray[np.float64],
+    known: dict[tuple[bytes, bytes], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """The place of an object in the world: of points in rows, from the right."""
+    """The place of an object in the world: of points in rows, from the right.
+
+    known: local matrices by their operations and numbers, to which a new one is added.
+    """
     inherits = archive.sample(properties, ".inherits", "b1", 1, time)
     if inherits is not None and not np.all(inherits):
         parent = np.eye(4)
@@ -189,20 +197,29 @@ def _matrix(
     values = archive.sample(properties, ".vals", "<f8", 0, time)
     if ops is None:
         return parent
+    numbers = np.zeros(0) if values is None else values.reshape(-1).astype(float)
+    key = (ops.tobytes(), numbers.tobytes())
+    if key not in known:
+        known[key] = _local(ops, numbers)
+    with np.errstate(all="ignore"):  # what is not finite is for others to judge
+        return known[key] @ parent
+
+
+def _local(ops: NDArray[Any], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The matrix of some operations, the first outermost."""
     kinds = [int(op) >> 4 for op in ops.reshape(-1)]
     if unknown := sorted({*kinds} - CHANNELS.keys()):
         raise ValueError(f"it has a transform of kind {unknown[0]}; it must be from 0 to 6")
-    numbers = np.zeros(0) if values is None else values.reshape(-1).astype(float)
     needed = sum(CHANNELS[kind] for kind in kinds)
     if len(numbers) != needed:
         raise ValueError(f"its transforms have {len(numbers)} numbers; they must have {needed}")
     local = np.eye(4)
-    with np.errstate(all="ignore"):  # what is not finite is for others to judge
+    with np.errstate(all="ignore"):
         for kind in kinds:
             count = CHANNELS[kind]
             local = _operation(kind, numbers[:count]) @ local
             numbers = numbers[count:]
-        return local @ parent
+    return local
 
 
 def _operation(kind: int, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
