@@ -77,7 +77,7 @@ def write(
     codes, rate = time_codes(times)
     regular = np.array_equal(codes - codes[0], np.arange(len(codes)))
     sampling = Sampling(1 / rate, (times[0],)) if regular else Sampling(ACYCLIC, tuple(times))
-    bonded = recording.fractions_at_points().astype(np.float32)
+    bonded = recording.fractions_at_points().astype("<f4")
     added = [
         _parameter(f"bonded_{name}", inside(bonded[..., kind], counts)[..., None], sampling=1)
         for kind, name in enumerate(BONDS)

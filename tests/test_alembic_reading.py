@@ -3,6 +3,7 @@
 They are put together by jaxhair/alembic_core.py; those of Blender are in test_blender.py.
 """
 
+import io
 import struct
 import time
 import tracemalloc
@@ -256,8 +257,6 @@ def test_other_containers_are_refused(tmp_path: Path) -> None:
 
 def archive(top: int | None, *, build: Any = None) -> bytes:
     """A file whose top object is at a place, or what `build` writes as it."""
-    import io
-
     with io.BytesIO() as file:
         writer = Writer(file)
         versions = [writer.data(struct.pack("<i", n)) for n in (0, 10803)]
@@ -273,6 +272,43 @@ def headers(names: Sequence[str], metadata: int = 1) -> bytes:
     """Of child objects."""
     each = [struct.pack("<I", len(n)) + n.encode() + bytes([metadata]) for n in names]
     return b"".join(each) + bytes(32)
+
+
+def test_metadata_may_stand_at_the_header(tmp_path: Path) -> None:
+    """Where there are too many for the list, or they are long: of objects and of properties."""
+
+    def text(size: int, *parts: str) -> bytes:
+        return b"".join(len(p).to_bytes(size, "little") + p.encode() for p in parts)
+
+    def build(writer: Writer) -> int:
+        sample = [writer.data(bytes(16), A.tobytes()), EMPTY_DATA]
+        count = [writer.data(bytes(16), struct.pack("<i", len(A))), EMPTY_DATA]
+        basis = [writer.data(bytes(16), bytes([1, 0, 0, 0]))]
+        children = [writer.group(each) for each in (sample, count, basis)]
+        info = [2 | 10 << 4 | 3 << 12, 2 | 6 << 4 | 1 << 12, 1 | 1 << 4 | 4 << 12]
+        names = ("P", "nVertices", "curveBasisAndType")
+        said = b"".join(
+            # a size hint of 2 bytes, constant, and metadata behind the name
+            struct.pack("<IH", bits | 1 << 2 | 0x800 | 0xFF << 20, 1) + text(2, name, "x" * 300)
+            for bits, name in zip(info, names, strict=True)
+        )
+        geometry = writer.group([*children, writer.data(said)])
+        header = struct.pack("<I", 0xFF << 20) + text(1, ".geom", "")
+        inside = writer.group([geometry, writer.data(header)])
+        hair = writer.group([inside, writer.data(headers([]))])
+        metadata = "y=" + "z" * 300 + ";schema=AbcGeom_Curve_v2"
+        header = text(4, "hair") + b"\xff" + text(4, metadata) + bytes(32)
+        return writer.group([0, hair, writer.data(header)])
+
+    (tmp_path / "a.abc").write_bytes(archive(None, build=build))
+    assert_same(jh.read_strands(tmp_path / "a.abc", up="z"), [A])
+
+
+def test_times_must_be_there_for_all_samples(tmp_path: Path) -> None:
+    """Where they are not at a constant rate."""
+    moving = curves(frames=[[n * A] for n in range(4)], sampling=2)
+    with pytest.raises(ValueError, match="4 samples at 3 times; there must be a time for each"):
+        read(tmp_path / "a.abc", moving)
 
 
 def test_an_object_inside_itself_is_refused(tmp_path: Path) -> None:
