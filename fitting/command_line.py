@@ -18,6 +18,7 @@ def add_strand_files(parser: Any) -> None:
     )
     add(
         "--up",
-        help="axis of strand files that points up (default: what a USD file says, z for others)",
+        help="axis of strand files that points up (default: what a USD file says, y for "
+        "Alembic, z for others)",
         **one_of("y", "z"),
     )

@@ -59,7 +59,7 @@ def parser() -> Parser:
         "--target",
         nargs="+",
         metavar="FILE",
-        help="strands (.hair, .data, .npz, USD), each as FILE or STATE=FILE with a STATE of "
+        help="strands (.hair, .data, .npz, .abc, USD), each as FILE or STATE=FILE with a STATE of "
         f"{', '.join(STATES)} (in this order if not named); or one .toml of measured curls "
         "(default: the packaged curls)",
     )

@@ -46,7 +46,7 @@ def parser() -> Parser:
         ],
     )
     add = top.add_argument
-    add("file", metavar="FILE", help="strands as they hang: .hair, .data, .npz or USD")
+    add("file", metavar="FILE", help="strands as they hang: .hair, .data, .npz, .abc or USD")
     add("--unloaded", metavar="FILE", help="the same strands without weight")
     add_strand_files(top)
     add("--strands", type=whole(1), help="how many to use at most, spread evenly (default: all)")

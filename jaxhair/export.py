@@ -1,4 +1,4 @@
-"""A recording as a file: arrays, USD, strands, a picture or a movie, by the file's ending."""
+"""A recording as a file: arrays, USD, Alembic, strands, pictures, by the file's ending."""
 
 import os
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ over its rest length less 1, or curvature [1/m]."""
 
 USD = (".usdc", ".usda", ".usd")
 PICTURES = (".png", ".gif", ".mp4")
-ENDINGS = (".npz", *USD, ".hair", ".data", *PICTURES, ".html")
+ENDINGS = (".npz", *USD, ".abc", ".hair", ".data", *PICTURES, ".html")
 
 
 def save(
@@ -47,6 +47,8 @@ def save(
     |                | number of the scene as `parameter:<name>`                                |
     | `.usdc .usda   | animated BasisCurves with widths, colours and bonded fractions, and the  |
     | .usd`          | obstacles, see `jaxhair.usd`; needs the extra `usd`                      |
+    | `.abc`         | animated Alembic Curves with widths and bonded fractions, see            |
+    |                | `jaxhair.alembic`                                                        |
     | `.hair .data`  | the strands of one frame                                                 |
     | `.png`         | a picture of one frame                                                   |
     | `.gif .mp4`    | a movie; needs the extra `pictures`, as `.png` does                      |
@@ -55,10 +57,11 @@ def save(
     Arguments:
         frame: for what holds one frame, and the one that a web page shows first; the last.
         color_by: kind of bond whose fraction is shown from blue (0) to red (1), in pictures and
-            USD; a web page can show "strain" and "curvature" too.
+            USD, and written to Alembic; a web page can show "strain" and "curvature" too.
         overwrite: replace a file that exists. progress: show a bar for movies.
-        options: of `jaxhair.usd.write` for USD: basis, width, color, unit, up; of `view` for a web
-            page; of `jaxhair.pictures.Options` for pictures and movies.
+        options: of `jaxhair.usd.write` for USD: basis, width, color, unit, up; of
+            `jaxhair.alembic.write` for Alembic: basis, width, unit, up; of `view` for a web page;
+            of `jaxhair.pictures.Options` for pictures and movies.
 
     Raises ValueError for another ending, kind or frame, and FileExistsError.
     """
@@ -85,6 +88,10 @@ def save(
         from jaxhair import usd
 
         usd.write(path, recording, color_by=color_by, overwrite=overwrite, **options)
+    elif ending == ".abc":
+        from jaxhair import alembic
+
+        alembic.write(path, recording, color_by=color_by, overwrite=overwrite, **options)
     else:
         _draw(path, recording, frame, color_by, overwrite, progress, options)
 

@@ -1,6 +1,7 @@
 """The bytes of strand files, .hair, .data and .npz; what they hold stands in `jaxhair.files`.
 
-USD files are written by usd.py and read by usd_reading.py.
+Alembic files are written by alembic.py and read by alembic_reading.py, USD files by usd.py and
+usd_reading.py.
 """
 
 import struct
@@ -174,10 +175,23 @@ def _write_usd(path: Path, points: Points, counts: Counts, unit: float, up: str)
     write_still(path, points, counts, unit=unit, up=up)
 
 
+def _read_abc(data: bytes, frame: int) -> tuple[Points, Counts]:
+    from jaxhair.alembic_reading import read
+
+    return read(data, frame)
+
+
+def _write_abc(path: Path, points: Points, counts: Counts, unit: float, up: str) -> None:
+    from jaxhair.alembic import write_still
+
+    write_still(path, points, counts, unit=unit)
+
+
 _FORMATS: dict[str, tuple[Reader | None, Writer]] = {
     ".hair": (_read_hair, _write_hair),
     ".data": (_read_data, _write_data),
     ".npz": (_read_npz, _write_npz),
+    ".abc": (_read_abc, _write_abc),
     **dict.fromkeys((".usd", ".usda", ".usdc"), (None, _write_usd)),
 }
 
@@ -190,3 +204,8 @@ def format_of(path: Path) -> tuple[Reader | None, Writer]:
         wanted = f"it must end in one of {', '.join(_FORMATS)}"
         raise ValueError(f"{check.short(path.name)} ends in {check.short(ending)}; {wanted}")
     return _FORMATS[ending]
+
+
+def usual_up(path: Path) -> str:
+    """The axis that points up in files that do not say it, where a user does not either."""
+    return "y" if path.suffix.lower() == ".abc" else "z"

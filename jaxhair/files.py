@@ -1,4 +1,4 @@
-"""Strand files: .hair, .data, .npz and USD.
+"""Strand files: .hair, .data, .npz, Alembic and USD.
 
 | ending  | content                                                                             |
 | ------- | ----------------------------------------------------------------------------------- |
@@ -6,13 +6,16 @@
 | `.data` | int32 strands; for each, int32 points and that many x y z as float32                |
 | `.npz`  | `positions`, shape (strands, points, 3) or (frames, strands, points, 3), of which   |
 |         | one frame is read; optionally `counts`, the points of each strand                   |
+| `.abc`  | Alembic's Curves in one frame, see `jaxhair.alembic_reading`                        |
 | `.usd`, | BasisCurves at one time, see `jaxhair.usd_reading`; needs the extra `usd`           |
 | `.usda`,|                                                                                     |
 | `.usdc` |                                                                                     |
 
-All are written in float32, and the first three little-endian. Of these none says what its unit of
+All are written in float32, and the first four little-endian. Of these none says what its unit of
 length is or which of its axes points up, so a reader must know: `unit` and `up` of the functions
-below. USD files say it; where one does not, by USD's rules it is in centimetres and Y up.
+below, by default metres, and Z up, but Y up in Alembic files, as Blender and Houdini write them
+(Maya and Unreal count in centimetres). USD files say it; where one does not, by USD's rules it is
+in centimetres and Y up.
 """
 
 import os
@@ -26,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxhair import check, usd_reading
 from jaxhair.arrays import check_regular, contents, numbers
-from jaxhair.file_formats import Counts, Points, check_counts, format_of
+from jaxhair.file_formats import Counts, Points, check_counts, format_of, usual_up
 from jaxhair.output import new_file
 
 # Padding strands to one length can need far more memory than the file: refused above this many
@@ -112,15 +115,16 @@ def read_curves(
     frame: int = -1,
     time: float | None = None,
 ) -> Curves:
-    """Strands of a .hair, .data, .npz or USD file, in metres and Z up, in the order of the file.
+    """Strands of a .hair, .data, .npz, .abc or USD file, in metres, Z up, in the file's order.
 
     unit: length of the file's unit [m]: 0.01 for centimetres, 0.0254 for inches. By default what a
     USD file says, 1 for the others.
-    up: the axis of the file that points up, by default what a USD file says, "z" for the others.
-    From "y", (x, y, z) becomes (x, -z, y), a rotation.
+    up: the axis of the file that points up, by default what a USD file says, "y" for an .abc and
+    "z" for the others. From "y", (x, y, z) becomes (x, -z, y), a rotation.
     skip_short: leave out strands of no or one point, which files may hold (roots of bald places)
     but which have no direction to simulate. Without it they are refused.
-    frame: of an animated .npz or USD file, by default the last; below 0 it counts from the end.
+    frame: of an animated .npz, .abc or USD file, by default the last; below 0 it counts from the
+    end.
     time: of a USD file [s], in place of a frame; between frames it interpolates.
 
     A file may hold no strands; then `points` has shape (0, 0, 3).
@@ -197,7 +201,7 @@ def _read(
             points, counts, own_unit, own_up = usd_reading.read(path, frame=frame, time=time)
         else:
             points, counts = reader(data, int(frame))
-            own_unit, own_up = 1.0, "z"
+            own_unit, own_up = 1.0, usual_up(path)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return _metres(points, own_unit if unit is None else unit, up or own_up), counts
@@ -224,13 +228,14 @@ def write_curves(
     curves: Curves,
     *,
     unit: float = 1.0,
-    up: Literal["y", "z"] = "z",
+    up: Literal["y", "z"] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write strands to a .hair, .data, .npz or USD file in the given unit and axes, as float32.
+    """Write strands to a .hair, .data, .npz, .abc or USD file in a unit and axes, as float32.
 
     unit: length of the file's unit [m]: 0.01 for centimetres, 0.0254 for inches.
-    up: the axis of the file that points up. With "y", (x, y, z) becomes (x, z, -y), a rotation.
+    up: the axis of the file that points up, by default "y" in an .abc, "z" in the others. With "y",
+    (x, y, z) becomes (x, z, -y), a rotation.
 
     The file appears when it is complete; see `jaxhair.output.new_file` for what is raised where
     it exists or its folder does not. Raises ValueError where the ending is another, a coordinate
@@ -239,10 +244,11 @@ def write_curves(
     """
     path = check.path("path", path)
     _, writer = format_of(path)
-    check_unit(unit, up)
+    axis = usual_up(path) if up is None else up
+    check_unit(unit, axis)
     check.instance("curves", curves, Curves)
     check.flag("overwrite", overwrite)
-    points = to_unit(curves.points, unit, up)
+    points = to_unit(curves.points, unit, axis)
     if np.any(large := np.abs(points) > np.finfo(np.float32).max):
         place = tuple(int(i) for i in np.argwhere(large)[0])
         raise ValueError(
@@ -250,7 +256,7 @@ def write_curves(
             "fit into float32"
         )
     with new_file(path, overwrite=overwrite) as temporary:
-        writer(temporary, points.astype("<f4"), curves.counts, unit, up)
+        writer(temporary, points.astype("<f4"), curves.counts, unit, axis)
 
 
 def check_unit(unit: float, up: str) -> None:

@@ -30,8 +30,8 @@ def parser() -> Parser:
     top = Parser(
         "python -m jaxhair simulate",
         "Simulates one of the paper's scenes and writes what the output's ending says: arrays "
-        "(.npz), the animation for other programs (.usdc), strands of the last frame (.hair), a "
-        "picture of it (.png), a movie (.mp4) or a web page to turn and play it (.html).",
+        "(.npz), the animation for other programs (.usdc, .abc), strands of the last frame "
+        "(.hair), a picture of it (.png), a movie (.mp4) or a page to turn and play it (.html).",
         [
             "python -m jaxhair simulate perm --prepared --no-contact --output perm.png",
             "python -m jaxhair simulate bed-hair --strands 50 --seconds 2 --output bed-hair.gif",

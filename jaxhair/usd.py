@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 
 from jaxhair import check, shading
+from jaxhair.animated_curves import bezier_points, boxes, inside, time_codes, widths_of
 from jaxhair.extras import optional
-from jaxhair.fibre import PhysicalFibre
 from jaxhair.file_formats import HAIR_DIAMETER
 from jaxhair.files import check_unit, to_unit
 from jaxhair.output import new_file
 from jaxhair.pictures import HAIR_COLOR, Color
 from jaxhair.recording import Recording
-from jaxhair.scene import Scene
 from jaxhair.strands import BONDS
 from jaxhair.usd_obstacles import Solid, solids, write_obstacles
 
@@ -81,7 +80,7 @@ def write(
         stage = _stage(unit, up)
         _time(stage, codes, rate, recording)
         curves = _curves(stage, points, counts, codes, basis)
-        widths = _widths(recording.scene, width) / unit
+        widths = widths_of(recording.scene, width) / unit
         _set_widths(curves, widths, _sizes(counts, basis))
         _set_extents(curves, points, counts, codes, float(widths.max()))
         _set_primvars(curves, bonded, colors, counts, codes, basis)
@@ -105,45 +104,6 @@ def write_still(
     _set_widths(curves, np.array([width]), counts)
     _set_extents(curves, points[None], counts, None, width)
     stage.GetRootLayer().Export(str(path))
-
-
-def time_codes(times: np.ndarray) -> tuple[np.ndarray, float]:
-    """Time codes of frames at some times [s], and how many there are a second."""
-    if len(times) < 2:
-        return times * 24.0, 24.0
-    steps = np.diff(times)
-    if not np.all(steps > 0):
-        raise ValueError("times of a recording must grow from frame to frame")
-    rate = 1 / float(np.median(steps))
-    if abs(rate - round(rate)) < 1e-4 * rate:
-        rate = float(round(rate))
-    codes = times * rate
-    whole = np.round(codes)
-    # times are sums of time steps, whose rounding is no reason for a fractional code
-    return np.where(np.abs(codes - whole) < 1e-3, whole, codes), rate
-
-
-def bezier_points(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Control points of the Bezier curves that are the pinned Catmull-Rom curves through points.
-
-    points: shape (..., strands, points, 3). Returns shape (..., strands, 3 points - 2, 3), of
-    which a strand has 3 count - 2.
-    """
-    place, last = np.arange(points.shape[-2]), (counts - 1)[:, None]
-    exact = points.astype(float)
-
-    def at(shift: int) -> np.ndarray:
-        index = np.clip(place + shift, 0, last)[..., None]
-        index = np.broadcast_to(index, (*points.shape[:-1], 1))
-        return np.take_along_axis(exact, index, -2)
-
-    # USD's phantom points, 2 p_0 - p_1 before the first, make the ends' slopes those of the edges
-    inner = (place > 0) & (place < last)
-    slope = (at(1) - at(-1)) / np.where(inner, 2, 1)[..., None]
-    start, end = exact[..., :-1, :], exact[..., 1:, :]
-    handles = (start + slope[..., :-1, :] / 3, end - slope[..., 1:, :] / 3)
-    parts = np.stack([start, *handles], -2).reshape(*points.shape[:-2], -1, 3)
-    return np.concatenate([parts, exact[..., -1:, :]], -2).astype(points.dtype)
 
 
 def _stage(unit: float, up: str) -> Any:
@@ -177,13 +137,6 @@ def _sizes(counts: np.ndarray, basis: str) -> np.ndarray:
     return 3 * counts - 2 if basis == "bezier" else counts
 
 
-def _inside(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Without the padding: from (frames, strands, points, ...) to (frames, all points, ...)."""
-    mask = np.arange(points.shape[2]) < counts[:, None]
-    kept: np.ndarray = np.ascontiguousarray(points[:, mask])
-    return kept
-
-
 def samples(attribute: Any, values: Sequence[Any], codes: np.ndarray | None) -> None:
     """Sets an attribute's value of each frame, or the only one."""
     if codes is None or len(values) == 1:
@@ -205,7 +158,7 @@ def _curves(
     sizes = _sizes(counts, basis)
     curves.CreateCurveVertexCountsAttr(vt.IntArray.FromNumpy(sizes.astype(np.int32)))
     control = bezier_points(points, counts) if basis == "bezier" else points
-    rows = [vt.Vec3fArray.FromNumpy(row) for row in _inside(control, sizes)]
+    rows = [vt.Vec3fArray.FromNumpy(row) for row in inside(control, sizes)]
     attribute = curves.CreatePointsAttr()
     if codes is None:
         attribute.Set(rows[0])
@@ -213,20 +166,6 @@ def _curves(
         for code, row in zip(codes, rows, strict=True):
             attribute.Set(row, float(code))
     return curves
-
-
-def _widths(scene: Scene, width: float | None) -> np.ndarray:
-    """[m], shape (1,) or (strands,)."""
-    if width is not None:
-        check.positive("width", width)
-        return np.array([float(width)])
-    fibre = scene.fibre
-    if not isinstance(fibre, PhysicalFibre):
-        return np.array([HAIR_DIAMETER])
-    minor = fibre.radius if fibre.minor_radius is None else fibre.minor_radius
-    # an elliptical hair is as wide as the round one of its area
-    widths = 2 * np.sqrt(np.asarray(fibre.radius, float) * np.asarray(minor, float)).reshape(-1)
-    return widths[:1] if np.all(widths == widths[0]) else widths
 
 
 def _set_widths(curves: Any, widths: np.ndarray, sizes: np.ndarray) -> None:
@@ -243,9 +182,7 @@ def _set_extents(
     if len(counts) == 0:
         return
     vt = optional("pxr.Vt", "usd")
-    # of the curve's hull, since a Catmull-Rom curve leaves that of its points
-    hull = _inside(bezier_points(points, counts), 3 * counts - 2)
-    box = np.stack([hull.min(1) - width / 2, hull.max(1) + width / 2], 1).astype(np.float32)
+    box = boxes(points, counts, width).astype(np.float32)
     samples(curves.CreateExtentAttr(), [vt.Vec3fArray.FromNumpy(b) for b in box], codes)
 
 
@@ -264,10 +201,10 @@ def _set_primvars(
     api = geom.PrimvarsAPI(curves)
     for kind, name in enumerate(BONDS):
         primvar = api.CreatePrimvar(f"bonded_{name}", sdf.ValueTypeNames.FloatArray, each)
-        rows = _changing(_inside(bonded[..., kind], counts))
+        rows = _changing(inside(bonded[..., kind], counts))
         samples(primvar.GetAttr(), [vt.FloatArray.FromNumpy(row) for row in rows], codes)
     color = curves.CreateDisplayColorPrimvar("constant" if colors.ndim == 2 else each)
-    rows = colors[None] if colors.ndim == 2 else _changing(_inside(colors, counts))
+    rows = colors[None] if colors.ndim == 2 else _changing(inside(colors, counts))
     values = [vt.Vec3fArray.FromNumpy(np.ascontiguousarray(row, np.float32)) for row in rows]
     samples(color.GetAttr(), values, codes)
 

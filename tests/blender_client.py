@@ -1,8 +1,9 @@
-"""What Blender makes of a USD file: run by an interpreter that has the `bpy` wheel.
+"""What Blender makes of a USD or Alembic file: run by an interpreter that has the `bpy` wheel.
 
-    python blender_client.py FILE.usdc FOUND.npz [PICTURE.png] [CODE ...]
+    python blender_client.py FILE FOUND.npz [PICTURE.png | EXPORT.abc] [CODE ...]
 
-Writes positions, colours and heights of meshes at each time code, and draws the last.
+Writes positions, colours and heights of meshes at each time code; draws the last, or exports all
+as Alembic. Frames are tenths of a second.
 """
 
 import sys
@@ -75,11 +76,26 @@ def positions(hair) -> np.ndarray:
     return found @ matrix[:3, :3].T + matrix[:3, 3]
 
 
+def export(path: str, first: float, last: float) -> None:
+    """All as Alembic; in this process, since one in the background ends with it."""
+    bpy.ops.wm.alembic_export(
+        filepath=path,
+        start=int(first),
+        end=int(last),
+        export_hair=True,
+        as_background_job=False,
+    )
+
+
 def main() -> None:
     """See above."""
     file, output, picture, *codes = sys.argv[1:]
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.wm.usd_import(filepath=file)
+    bpy.context.scene.render.fps = 10
+    if file.endswith(".abc"):
+        bpy.ops.wm.alembic_import(filepath=file, as_background_job=False)
+    else:
+        bpy.ops.wm.usd_import(filepath=file)
     (hair,) = (o for o in bpy.data.objects if o.type == "CURVES")
     meshes = sorted((o for o in bpy.data.objects if o.type == "MESH"), key=lambda o: o.name)
     found: dict[str, list] = {"positions": [], "colors": [], "heights": []}
@@ -87,7 +103,8 @@ def main() -> None:
         at(code)
         shown = hair.evaluated_get(bpy.context.evaluated_depsgraph_get())
         found["positions"].append(positions(hair))
-        found["colors"].append(attribute(shown.data, "displayColor", "color", 4)[:, :3])
+        if "displayColor" in shown.data.attributes:
+            found["colors"].append(attribute(shown.data, "displayColor", "color", 4)[:, :3])
         graph = bpy.context.evaluated_depsgraph_get()
         heights = []
         for mesh in meshes:
@@ -95,17 +112,20 @@ def main() -> None:
             heights.append(np.mean([(mesh.matrix_world @ v.co)[2] for v in data.vertices]))
         found["heights"].append(heights)
     curves = hair.data
+    bonded = "bonded_hydrogen" in curves.attributes  # Alembic's own parameters are not imported
     np.savez(
         output,
         **{name: np.array(values) for name, values in found.items()},
         counts=[c.points_length for c in curves.curves],
         radius=attribute(curves, "radius", "value", 1)[:, 0],
-        bonded=attribute(curves, "bonded_hydrogen", "value", 1)[:, 0],
+        bonded=attribute(curves, "bonded_hydrogen", "value", 1)[:, 0] if bonded else [],
         meshes=[m.name for m in meshes],
         range=[bpy.context.scene.frame_start, bpy.context.scene.frame_end],
         version=bpy.app.version_string,
     )
-    if picture:
+    if picture.endswith(".abc"):
+        export(picture, float(codes[0]), float(codes[-1]))
+    elif picture:
         draw(picture)
 
 

@@ -1,4 +1,4 @@
-"""Our USD files in Blender itself, without a window.
+"""Our USD and Alembic files in Blender itself, without a window, and its Alembic files in ours.
 
 Skipped unless JAXHAIR_BLENDER_PYTHON names an interpreter that has the `bpy` wheel:
 
@@ -23,6 +23,7 @@ import jaxhair as jh
 
 BLENDER = os.environ.get("JAXHAIR_BLENDER_PYTHON")
 CLIENT = Path(__file__).with_name("blender_client.py")
+HAIR = Path(__file__).with_name("blender_hair.py")
 pytestmark = pytest.mark.skipif(not BLENDER, reason="JAXHAIR_BLENDER_PYTHON is not set")
 pytest.importorskip("pxr", reason="needs usd-core")
 
@@ -109,3 +110,74 @@ def test_blender_has_colours_and_obstacles_and_draws(tmp_path: Path) -> None:
     rows = np.arange(len(pixels))[:, None]
     assert min(red.sum(), blue.sum()) > 300
     assert np.mean(rows[red.any(1)]) < np.mean(rows[blue.any(1)])  # the roots are above
+
+
+@pytest.mark.parametrize("basis", ["linear", "catmullRom"])
+@pytest.mark.parametrize("ragged", [False, True], ids=["equal", "ragged"])
+def test_blender_has_our_positions_of_alembic(tmp_path: Path, basis: str, ragged: bool) -> None:
+    """Of every frame bit for bit as float32, at irregular times too, and Z up again."""
+    counts = [33, 20, 2, 3] * 10 if ragged else None
+    of = recording(counts)
+    jh.save(tmp_path / "hair.abc", of, basis=basis)
+    found = blender(tmp_path / "hair.abc", tmp_path)
+    used = of.scene.strands.counts
+    assert found["counts"].tolist() == used.tolist()
+    assert np.array_equal(found["positions"], of.positions[:, np.arange(33) < used[:, None]])
+    assert found["radius"] == pytest.approx(40e-6)
+    assert found["range"].tolist() == [0, 4]
+
+
+def test_blender_has_regular_frames_and_still_strands(tmp_path: Path) -> None:
+    """At a constant rate from the start; and one frame at all times."""
+    of = recording()
+    chosen = [0, 1, 2, 4, 5]
+    observed = {name: values[chosen] for name, values in of.observed.items()}
+    regular = jh.Recording(of.scene, TIMES[chosen], observed, tuple(PHASES[i] for i in chosen))
+    jh.save(tmp_path / "hair.abc", regular, unit=0.01)
+    found = blender(tmp_path / "hair.abc", tmp_path)
+    want = 100 * of.positions.reshape(len(TIMES), -1, 3)
+    assert found["positions"][chosen] == pytest.approx(want[chosen], abs=1e-5)
+    assert found["radius"] == pytest.approx(40e-4)
+    still = jh.Curves.from_list(
+        [of.positions[0, 0], of.positions[0, 1, :1], of.positions[0, 2, :9]]
+    )
+    jh.write_curves(tmp_path / "still.abc", still)
+    found = blender(tmp_path / "still.abc", tmp_path)
+    assert found["counts"].tolist() == [33, 1, 9]
+    for points in found["positions"]:
+        assert np.array_equal(points, np.concatenate(still.to_list()).astype(np.float32))
+
+
+def test_we_read_what_blender_writes_of_our_hair(tmp_path: Path) -> None:
+    """USD into Blender, and out of it as Alembic: its whole frames."""
+    of = recording([33, 20, 2, 3] * 10)
+    jh.save(tmp_path / "hair.usdc", of)
+    blender(tmp_path / "hair.usdc", tmp_path, picture=str(tmp_path / "out.abc"))
+    for frame, ours in enumerate([0, 1, 2, 4, 5]):
+        curves = jh.read_curves(tmp_path / "out.abc", frame=frame)
+        assert curves.counts.tolist() == of.scene.strands.counts.tolist()
+        for found, want in zip(curves.to_list(), of.positions[ours], strict=True):
+            assert found == pytest.approx(want[: len(found)], abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["CATMULL_ROM", "POLY", "BEZIER", "NURBS"])
+def test_we_read_blenders_own_hair(tmp_path: Path, kind: str) -> None:
+    """Curves of each kind below objects that are turned, scaled and moved; no NURBS."""
+    command = [
+        str(BLENDER),
+        str(HAIR),
+        kind,
+        str(tmp_path / "hair.abc"),
+        str(tmp_path / "hair.npy"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    if kind == "NURBS":
+        with pytest.raises(ValueError, match=r"strands' is not readable: its type is 'NURBS'"):
+            jh.read_strands(tmp_path / "hair.abc")
+        return
+    for frame, want in enumerate(np.load(tmp_path / "hair.npy")):
+        found = jh.read_strands(tmp_path / "hair.abc", frame=frame)
+        assert [len(strand) for strand in found] == [5, 7]
+        # Blender's matrices are of float32, here with entries up to 10
+        assert np.concatenate(found) == pytest.approx(want, abs=1e-5)

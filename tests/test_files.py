@@ -8,10 +8,11 @@ import zipfile
 import numpy as np
 import pytest
 
+from jaxhair.alembic import write_still
 from jaxhair.arrays import read_arrays, write_arrays
-from jaxhair.files import Curves, read_curves, read_strands, write_curves
+from jaxhair.files import Curves, read_curves, read_strands, to_unit, write_curves
 
-ENDINGS = [".hair", ".data", ".npz"]
+ENDINGS = [".hair", ".data", ".npz", ".abc"]
 
 
 def strands(*sizes, seed=0):
@@ -190,14 +191,24 @@ def test_round_trip_in_another_unit(tmp_path, ending, unit, up):
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_unit_and_axis(tmp_path, ending):
     path = tmp_path / f"a{ending}"
-    write_curves(path, Curves.from_list([A]))
-    np.testing.assert_allclose(read_curves(path, unit=0.01).points[0], np.multiply(A, 0.01))
+    write_curves(path, Curves.from_list([A]), up="z")
+    scaled = read_curves(path, unit=0.01, up="z").points[0]
+    np.testing.assert_allclose(scaled, np.multiply(A, 0.01))
     turned = [(1, -3, 2), (4, -6, 5)]
     np.testing.assert_array_equal(read_curves(path, up="y").points[0], turned)
     write_curves(tmp_path / f"b{ending}", Curves.from_list([A]), unit=0.5, up="y")
     np.testing.assert_array_equal(
-        read_curves(tmp_path / f"b{ending}").points[0], [(2, 6, -4), (8, 12, -10)]
+        read_curves(tmp_path / f"b{ending}", up="z").points[0], [(2, 6, -4), (8, 12, -10)]
     )
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_alembic_is_y_up_by_default_and_the_others_z_up(tmp_path, ending):
+    path, up = tmp_path / f"a{ending}", "y" if ending == ".abc" else "z"
+    write_curves(path, Curves.from_list([A]))
+    assert_same(read_curves(path), [A])
+    assert_same(read_curves(path, up=up), [A])
+    assert not np.array_equal(read_curves(path, up="z" if up == "y" else "y").points[0], A)
 
 
 def test_the_change_of_axes_is_a_rotation(tmp_path):
@@ -307,6 +318,10 @@ def short_file(path):
         path.write_bytes(hair_bytes([1, 0, 2], [*A, (9, 9, 9), *B]))
     elif path.suffix == ".data":
         path.write_bytes(data_bytes(A, [(9, 9, 9)], B, []))
+    elif path.suffix == ".abc":
+        points = np.zeros((4, 3, 3), "<f4")
+        points[0, :2], points[1, 0], points[2] = A, 9, B
+        write_still(path, to_unit(points, 1.0, "y").astype("<f4"), np.array([2, 1, 3, 0]), unit=1.0)
     else:
         points = np.zeros((4, 3, 3))
         points[0, :2], points[1, 0], points[2] = A, 9, B
@@ -344,7 +359,7 @@ def test_what_is_left_out_need_not_be_finite(tmp_path):
 # --- refusals
 
 
-@pytest.mark.parametrize("name", ["a.abc", "a", "a.hair.gz", "hair"])
+@pytest.mark.parametrize("name", ["a.obj", "a", "a.hair.gz", "hair"])
 def test_other_endings(tmp_path, name):
     for call in (
         lambda: read_curves(tmp_path / name),
@@ -449,6 +464,7 @@ def test_damaged_files_are_refused_or_read(tmp_path, ending):
     rng = np.random.default_rng(1)
     changes = [(i, v) for i in range(len(data)) for v in (0, 1, 0x7F, 0xFF)]
     changes += [(int(i), int(v)) for i, v in rng.integers((len(data), 256), size=(1000, 2))]
+    changes = changes[:: 5 if ending == ".abc" else 1]  # whose file is the longest
     for place, value in changes:
         changed = bytearray(data)
         changed[place] = value
@@ -519,7 +535,7 @@ def test_strands_too_uneven_to_pad(tmp_path, ending):
         data = struct.pack("<i", short + 1) + (struct.pack("<i", 2) + bytes(24)) * short
         path.write_bytes(data + struct.pack("<i", long) + bytes(12 * long))
     else:
-        pytest.skip("an .npz file holds its strands padded")
+        pytest.skip("it is written from padded strands")
     with pytest.raises(ValueError, match=f"strand {short} has {long} points.*at most 100 times"):
         read_curves(path)
 
@@ -538,13 +554,13 @@ def test_values_that_are_not_finite(tmp_path, ending, value):
     if ending == ".npz":
         npz(path, positions=points)
     else:
-        write_curves(path, Curves.from_list([A, A, A]))
+        write_curves(path, Curves.from_list([A, A, A]), up="z")
         data = path.read_bytes()
         good, bad = np.array(A, "<f4").tobytes(), points[1].tobytes()
         first, rest = data.split(good, 1)
         path.write_bytes(first + good + rest.replace(good, bad, 1))
     with pytest.raises(ValueError) as raised:
-        read_curves(path)
+        read_curves(path, up="z")
     for word in (str(path), "point 1 of strand 1 is [4.0, 5.0, ", "finite"):
         assert word in str(raised.value)
 
@@ -735,7 +751,7 @@ def test_values_too_large_for_the_file(tmp_path, ending):
     for value, unit in ((1e39, 1), (3.5e38, 1), (1e30, 1e-9), (1e308, 1e-12)):
         curves = Curves.from_list([A, [(0, 0, 0), (0, -value, 0)]])
         with pytest.raises(ValueError, match=r"points has the value .* at \(1, 1, 1\).*float32"):
-            write_curves(tmp_path / f"a{ending}", curves, unit=unit)
+            write_curves(tmp_path / f"a{ending}", curves, unit=unit, up="z")
     assert list(tmp_path.iterdir()) == []
 
 

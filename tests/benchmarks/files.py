@@ -71,6 +71,7 @@ def main() -> None:
             (".usdc", {"basis": "bezier"}),
             (".usdc", {"color_by": "hydrogen"}),
             (".usda", {}),
+            (".abc", {}),
             (".hair", {}),
             (".data", {}),
         ):
