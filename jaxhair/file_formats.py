@@ -1,6 +1,6 @@
 """The bytes of strand files, .hair, .data and .npz; what they hold stands in `jaxhair.files`.
 
-Alembic files are written by alembic.py and read by alembic_reading.py, USD files by usd.py and
+Alembic files are those of `jaxhair.alembic`; USD files are written by usd.py and read by
 usd_reading.py.
 """
 
@@ -176,13 +176,13 @@ def _write_usd(path: Path, points: Points, counts: Counts, unit: float, up: str)
 
 
 def _read_abc(data: bytes, frame: int) -> tuple[Points, Counts]:
-    from jaxhair.alembic_reading import read
+    from jaxhair.alembic.reading import read
 
     return read(data, frame)
 
 
 def _write_abc(path: Path, points: Points, counts: Counts, unit: float, up: str) -> None:
-    from jaxhair.alembic import write_still
+    from jaxhair.alembic.writing import write_still
 
     write_still(path, points, counts, unit=unit)
 

@@ -6,7 +6,7 @@
 | `.data` | int32 strands; for each, int32 points and that many x y z as float32                |
 | `.npz`  | `positions`, shape (strands, points, 3) or (frames, strands, points, 3), of which   |
 |         | one frame is read; optionally `counts`, the points of each strand                   |
-| `.abc`  | Alembic's Curves in one frame, see `jaxhair.alembic_reading`                        |
+| `.abc`  | Alembic's Curves in one frame, see `jaxhair.alembic.reading`                        |
 | `.usd`, | BasisCurves at one time, see `jaxhair.usd_reading`; needs the extra `usd`           |
 | `.usda`,|                                                                                     |
 | `.usdc` |                                                                                     |

@@ -14,9 +14,9 @@ from test_export import recording
 
 import jaxhair as jh
 from jaxhair.__main__ import main
-from jaxhair.alembic_core import ACYCLIC, TYPES
-from jaxhair.alembic_headers import Header
-from jaxhair.alembic_tree import Archive
+from jaxhair.alembic.archive_reading import Archive
+from jaxhair.alembic.archive_writing import ACYCLIC, TYPES
+from jaxhair.alembic.headers import Header
 
 BASES = ("linear", "catmullRom")
 FLOAT32 = 1e-7

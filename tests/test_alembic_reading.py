@@ -1,6 +1,7 @@
 """Alembic files of others: transforms, several objects, all sorts of curves, and bad bytes.
 
-They are put together by jaxhair/alembic_core.py; those of Blender are in test_blender.py.
+They are put together by `jaxhair.alembic.archive_writing`; those of Blender are in
+test_blender.py.
 """
 
 import io
@@ -16,9 +17,9 @@ import numpy as np
 import pytest
 
 import jaxhair as jh
-from jaxhair.alembic import BASES, STILL
-from jaxhair.alembic_core import ACYCLIC, Node, Property, Sampling, write_archive
-from jaxhair.ogawa import EMPTY_DATA, HEADER, Writer
+from jaxhair.alembic.archive_writing import ACYCLIC, Node, Property, Sampling, write_archive
+from jaxhair.alembic.ogawa import EMPTY_DATA, HEADER, Writer
+from jaxhair.alembic.writing import BASES, STILL
 
 A = np.array([[0.0, 0, 3], [1, 0, 2], [1, 1, 1], [2, 1, 0]], np.float32)
 B = 2 * A[:2] + 1

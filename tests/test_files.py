@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxhair.alembic import write_still
+from jaxhair.alembic.writing import write_still
 from jaxhair.arrays import read_arrays, write_arrays
 from jaxhair.files import Curves, read_curves, read_strands, to_unit, write_curves
 

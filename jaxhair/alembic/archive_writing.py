@@ -7,7 +7,7 @@
     property  its samples; of an array each with its dimensions
 
 Written once are samples that are the same bytes, and of a property only those from its first to
-its last change. Reading is in alembic_tree.py.
+its last change. Reading is in archive_reading.py.
 """
 
 import struct
@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxhair.ogawa import EMPTY_DATA, Writer
+from jaxhair.alembic.ogawa import EMPTY_DATA, Writer
 
 TYPES = ("b1", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
 """Of numbers, in the order of Alembic's PlainOldDataType."""

@@ -1,6 +1,6 @@
 """The objects, properties and samples of an Alembic file's bytes, of which nothing is trusted.
 
-What they are stands in alembic_core.py, which writes them. No part of a file is read twice but
+What they are stands in archive_writing.py, which writes them. No part of a file is read twice but
 samples, which may be shared, and of those not many times the file's size in all.
 """
 
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxhair.alembic_core import ACYCLIC, ELSEWHERE, FORMAT, SCALAR, TYPES
-from jaxhair.alembic_headers import (
+from jaxhair.alembic.archive_writing import ACYCLIC, ELSEWHERE, FORMAT, SCALAR, TYPES
+from jaxhair.alembic.headers import (
     COMPOUND,
     Cursor,
     Header,
@@ -19,7 +19,7 @@ from jaxhair.alembic_headers import (
     read_indexed,
     read_samplings,
 )
-from jaxhair.ogawa import EMPTY_GROUP, Container, is_data
+from jaxhair.alembic.ogawa import EMPTY_GROUP, Container, is_data
 
 _KEY = 16  # bytes before each sample
 _HASHES = 32  # bytes after the headers of objects

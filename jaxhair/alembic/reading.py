@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxhair import check
-from jaxhair.alembic_core import TYPES
-from jaxhair.alembic_headers import Header
-from jaxhair.alembic_tree import Archive, Object
+from jaxhair.alembic.archive_reading import Archive, Object
+from jaxhair.alembic.archive_writing import TYPES
+from jaxhair.alembic.headers import Header
 from jaxhair.usd_child import on_curve
 
 CURVES, XFORM = "AbcGeom_Curve_v", "AbcGeom_Xform_v"

@@ -12,7 +12,7 @@ Obstacles are not written: Unreal refuses grooms with meshes.
 Not written either: `groom_guide`, since Unreal does not render strands that are guides, and makes
 guides of the others by itself; `groom_width`, since it scales `width` where it imports, not that.
 
-Needs nothing but NumPy. Reading is in alembic_reading.py.
+Needs nothing but NumPy. Reading is in reading.py.
 """
 
 import os
@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxhair import check, shading
-from jaxhair.alembic_core import ACYCLIC, Node, Property, Sampling, write_archive
+from jaxhair.alembic.archive_writing import ACYCLIC, Node, Property, Sampling, write_archive
 from jaxhair.animated_curves import boxes, inside, time_codes, widths_of
 from jaxhair.file_formats import HAIR_DIAMETER
 from jaxhair.files import check_unit, to_unit

@@ -5,7 +5,7 @@
     data    number of bytes, and those
 
 All numbers are little-endian uint64. A reference is the place of a group or data in the file, and 0
-an empty one. What groups mean stands in alembic_core.py.
+an empty one. What groups mean stands in archive_writing.py.
 """
 
 import struct

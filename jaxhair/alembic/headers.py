@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxhair import check
-from jaxhair.alembic_core import (
+from jaxhair.alembic.archive_writing import (
     ARRAY,
     CHANGES,
     CONSTANT,
