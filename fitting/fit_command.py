@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from fitting.command_line import STRAND_UNITS, add_strand_files
 from fitting.constraints import Constraint, Positive, Simplex
 from fitting.fit import fit
 from fitting.measured import Measured, packaged, read
@@ -23,8 +22,10 @@ from jaxhair.options import (
     add_json,
     add_output,
     add_quiet,
+    add_strand_files,
     length,
     one_of,
+    strand_files,
     whole,
 )
 from jaxhair.progress import Progress
@@ -63,7 +64,7 @@ def parser() -> Parser:
         f"{', '.join(STATES)} (in this order if not named); or one .toml of measured curls "
         "(default: the packaged curls)",
     )
-    add_strand_files(top)
+    add_strand_files(top, read=True)
     add("--rod-diameter", type=length, help="such as 17mm (default: 0.6 of the curls' diameter)")
     add("--strands", type=whole(1), default=16,
         help="how many to use at most (default: %(default)d)")  # fmt: skip
@@ -90,7 +91,6 @@ def _measured(options: argparse.Namespace) -> Measured:
         return packaged()
     if len(options.target) == 1 and options.target[0].endswith(".toml"):
         return read(options.target[0])
-    unit = None if options.unit is None else STRAND_UNITS[options.unit]
     observed: dict[str, Any] = {}
     unnamed = iter(STATES)
     for text in options.target:
@@ -101,7 +101,7 @@ def _measured(options: argparse.Namespace) -> Measured:
                 raise Mistake(f"--target has {len(options.target)} files; at most {len(STATES)}")
         if state in observed:
             raise Mistake(f"--target has {state!r} twice; states must differ")
-        observed[state] = read_curves(path, unit=unit, up=options.up, skip_short=True)
+        observed[state] = read_curves(path, skip_short=True, **strand_files(options))
     return from_strands(
         observed,
         rod_diameter=options.rod_diameter,

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fitting.command_line import STRAND_UNITS, add_strand_files
 from fitting.many import SHARES, FitEach, quantiles
 from fitting.measures import curl
 from fitting.natural import REMEMBERED, STATE, UNLOADED, Natural, natural
@@ -17,7 +16,16 @@ from fitting.report import plain, versions
 from jaxhair import BONDS, Curves, read_strands, write_curves
 from jaxhair.command_line import OK, Mistake, Parser, status, wrote
 from jaxhair.export import check_new_folder
-from jaxhair.options import Switch, add_checkpoint, add_json, add_output, add_quiet, whole
+from jaxhair.options import (
+    Switch,
+    add_checkpoint,
+    add_json,
+    add_output,
+    add_quiet,
+    add_strand_files,
+    strand_files,
+    whole,
+)
 from jaxhair.output import new_file
 from jaxhair.progress import Progress
 
@@ -48,7 +56,7 @@ def parser() -> Parser:
     add = top.add_argument
     add("file", metavar="FILE", help="strands as they hang: .hair, .data, .npz, .abc or USD")
     add("--unloaded", metavar="FILE", help="the same strands without weight")
-    add_strand_files(top)
+    add_strand_files(top, read=True)
     add("--strands", type=whole(1), help="how many to use at most, spread evenly (default: all)")
     add("--points", type=whole(4), help="points on a simulated strand (default: 17 to 65)")
     add(
@@ -72,9 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _natural(options: argparse.Namespace) -> int:
     if options.unloaded is not None and not options.weight:
         raise Mistake("--no-weight is for strands of one file; leave out it or --unloaded")
-    unit = None if options.unit is None else STRAND_UNITS[options.unit]
+    files_are = strand_files(options)
     files = [options.file] + ([] if options.unloaded is None else [options.unloaded])
-    seen = [read_strands(path, unit=unit, up=options.up) for path in files]
+    seen = [read_strands(path, **files_are) for path in files]
     folder = Path(options.output)
     states = (STATE, REMEMBERED) if options.unloaded is None else (STATE, UNLOADED, REMEMBERED)
     names = (REPORT, PICTURE, *(STRANDS[state] for state in states))
@@ -102,8 +110,7 @@ def _natural(options: argparse.Namespace) -> int:
         hair,
         found,
         folder,
-        unit=unit or 1.0,
-        up=options.up or "z",
+        **files_are,
         overwrite=options.overwrite,
         files=[str(path) for path in files],
     )

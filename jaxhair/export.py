@@ -23,8 +23,9 @@ COLORS = (*BONDS, "strain", "curvature")
 over its rest length less 1, or curvature [1/m]."""
 
 USD = (".usdc", ".usda", ".usd")
+STRAND_FILES = (*USD, ".abc", ".hair", ".data")
 PICTURES = (".png", ".gif", ".mp4")
-ENDINGS = (".npz", *USD, ".abc", ".hair", ".data", *PICTURES, ".html")
+ENDINGS = (".npz", *STRAND_FILES, *PICTURES, ".html")
 
 
 def save(
@@ -60,8 +61,9 @@ def save(
             USD, and written to Alembic; a web page can show "strain" and "curvature" too.
         overwrite: replace a file that exists. progress: show a bar for movies.
         options: of `jaxhair.usd.write` for USD: basis, width, color, unit, up; of
-            `jaxhair.alembic.write` for Alembic: basis, width, unit, up; of `view` for a web page;
-            of `jaxhair.pictures.Options` for pictures and movies.
+            `jaxhair.alembic.write` for Alembic: basis, width, unit, up; of `write_curves` for
+            strands: unit, up; of `view` for a web page; of `jaxhair.pictures.Options` for pictures
+            and movies.
 
     Raises ValueError for another ending, kind or frame, and FileExistsError.
     """
@@ -74,10 +76,10 @@ def save(
     check_color(path, color_by)
     counts = recording.scene.strands.counts
     if ending == ".npz":
-        write_arrays(path, as_arrays(recording), overwrite=overwrite)
+        write_arrays(path, as_arrays(recording), overwrite=overwrite, **options)
     elif ending in (".hair", ".data"):
         curves = Curves(recording.positions[frame], counts)
-        write_curves(path, curves, overwrite=overwrite)
+        write_curves(path, curves, overwrite=overwrite, **options)
     elif ending == ".html":
         from jaxhair.viewer import view
 

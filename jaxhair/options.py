@@ -9,6 +9,8 @@ from typing import Any
 from jaxhair import check
 
 UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+STRAND_UNITS = {**UNITS, "inch": 0.0254}
+"""Units that strand files may be in [m]."""
 
 
 class Switch(argparse.Action):
@@ -130,6 +132,31 @@ def add_output(parser: Any, files: Sequence[str], *, required: bool = True) -> N
         + ("" if required else " (default: write no files)"),
     )
     parser.add_argument("--overwrite", action=Switch, help="replace files that exist")
+
+
+def add_strand_files(parser: Any, *, read: bool) -> None:
+    """Add `--unit` and `--up` of strand files that are read, or written."""
+    said = "what a USD file says, " if read else ""
+    files = "strand files" if read else "a .hair, .data, .abc or USD file"
+    add = parser.add_argument
+    add(
+        "--unit",
+        help=f"of lengths in {files} (default: {said}m)",
+        **one_of(*STRAND_UNITS),
+    )
+    add(
+        "--up",
+        help=f"axis of {files} that points up (default: {said}y for Alembic, z for others)",
+        **one_of("y", "z"),
+    )
+
+
+def strand_files(options: Any) -> dict[str, Any]:
+    """What `--unit` and `--up` say of strand files, as arguments unit [m] and up; without what was
+    not given."""
+    unit = None if options.unit is None else STRAND_UNITS[options.unit]
+    given = {"unit": unit, "up": options.up}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def add_checkpoint(parser: Any) -> None:

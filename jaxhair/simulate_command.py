@@ -5,7 +5,6 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
 
 import jax
 
@@ -14,13 +13,23 @@ from jaxhair.export import (
     COLORS,
     ENDINGS,
     PICTURES,
+    STRAND_FILES,
     check_color,
     check_drawing,
     check_ending,
     check_new,
     save,
 )
-from jaxhair.options import Switch, add_checkpoint, add_quiet, one_of, positive, whole
+from jaxhair.options import (
+    Switch,
+    add_checkpoint,
+    add_quiet,
+    add_strand_files,
+    one_of,
+    positive,
+    strand_files,
+    whole,
+)
 from jaxhair.recording import NotFinite, simulate
 from jaxhair.scene_options import NOTE, add_scene, listed, scene_of
 
@@ -53,6 +62,7 @@ def parser() -> Parser:
         **one_of(*COLORS),
     )
     add("--size", type=whole(1), default=800, help="of pictures, pixels (default: %(default)d)")
+    add_strand_files(group, read=False)
     group = top.add_argument_group("the work")
     add_checkpoint(group)
     group.add_argument(
@@ -85,9 +95,13 @@ def _simulate(options: argparse.Namespace) -> int:
     if options.output is None:
         raise Mistake(f"--output is missing; it must be a file with the ending "
                       f"{', '.join(ENDINGS)}")  # fmt: skip
-    drawing: dict[str, Any] = {}
-    if check_ending(options.output) in PICTURES:
-        drawing["size"] = (options.size, options.size)
+    ending = check_ending(options.output)
+    of_format = strand_files(options)
+    if of_format and ending not in STRAND_FILES:
+        allowed = f"be left out unless the file is one of {', '.join(STRAND_FILES)}"
+        raise Mistake(f"--{next(iter(of_format))} is given for a {ending} file; it must {allowed}")
+    if ending in PICTURES:
+        of_format["size"] = (options.size, options.size)
     check_color(options.output, options.color_by)
     check_new(options.output, overwrite=options.overwrite)
     check_drawing(options.output, options.size)
@@ -120,7 +134,7 @@ def _simulate(options: argparse.Namespace) -> int:
                 color_by=options.color_by,
                 overwrite=options.overwrite,
                 progress=not options.quiet,
-                **drawing,
+                **of_format,
             )
         except (ValueError, OSError, ImportError) as error:
             if not failed:

@@ -251,9 +251,15 @@ def test_wrong_options_leave_nothing(
 
 
 def test_the_command_writes_alembic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`python -m jaxhair simulate perm --output perm.abc`."""
+    """`python -m jaxhair simulate perm --unit cm --output perm.abc`."""
     path = tmp_path / "perm.abc"
     size = ["--strands", "2", "--points", "17", "--no-contact", "--seconds", "0.1"]
-    assert main(["simulate", "perm", "--prepared", *size, "--quiet", "--output", str(path)]) == 0
-    assert len(jh.read_curves(path).counts) == 2
+    command = ["simulate", "perm", "--prepared", *size, "--quiet", "--unit", "cm"]
+    assert main([*command, "--output", str(path)]) == 0
+    found = jh.read_curves(path, unit=0.01)
+    assert len(found.counts) == 2
+    edges = np.linalg.norm(np.diff(found.points, axis=1), axis=-1)
+    assert edges.sum(1) == pytest.approx(0.48, rel=0.05)
     assert capsys.readouterr().err == ""
+    assert main([*command, "--output", str(tmp_path / "perm.png")]) == 2
+    assert "--unit is given for a .png file" in capsys.readouterr().err

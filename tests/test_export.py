@@ -10,7 +10,7 @@ from PIL import Image
 
 import jaxhair as jh
 from jaxhair.arrays import read_arrays
-from jaxhair.export import ENDINGS, check_drawing, meshes
+from jaxhair.export import ENDINGS, STRAND_FILES, check_drawing, meshes
 
 FLOAT32 = 1e-7  # m, what writing strands in float32 may lose
 EXACT = 1e-12
@@ -87,6 +87,26 @@ def test_the_last_frames_strands_are_read_back(tmp_path: Path, ending: str) -> N
     curves = jh.read_curves(path)
     assert curves.counts.tolist() == [5, 5]
     assert np.abs(curves.points - recording().positions[-1]).max() < FLOAT32
+
+
+@pytest.mark.parametrize("ending", STRAND_FILES)
+def test_strands_are_in_the_unit_and_axes_asked_for(tmp_path: Path, ending: str) -> None:
+    """Written so, and not as if nothing had been said."""
+    path = tmp_path / f"a{ending}"
+    save(path, unit=0.01, up="y")
+    want = recording().positions[-1]
+    found = jh.read_curves(path, unit=1.0, up="z").points
+    turned = want[..., [0, 2, 1]] * [100.0, 100.0, -100.0]
+    assert np.abs(found - turned).max() < 100 * FLOAT32
+    assert np.abs(jh.read_curves(path, unit=0.01, up="y").points - want).max() < FLOAT32
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_options_that_a_format_does_not_have_are_refused(tmp_path: Path, ending: str) -> None:
+    """Whatever the format."""
+    with pytest.raises(TypeError, match="untit"):
+        save(tmp_path / f"a{ending}", untit=0.01)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("frame", [0, 2, -1, -4])
