@@ -6,7 +6,6 @@ test_blender.py.
 
 import io
 import struct
-import time
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -312,6 +311,16 @@ def test_times_must_be_there_for_all_samples(tmp_path: Path) -> None:
         read(tmp_path / "a.abc", moving)
 
 
+@pytest.mark.parametrize("changes", [(3, 2), (2, 4), (0, 2), (255, 255)])
+def test_changes_must_be_among_the_samples(tmp_path: Path, changes: tuple[int, int]) -> None:
+    """The first and the last sample that differ from the one before."""
+    path = written(tmp_path / "a.abc", curves(frames=[[A], [A], [B, A], [B, A]], sampling=1))
+    data, claim = path.read_bytes(), bytes([4, 2, 2, 1, 1]) + b"P"
+    assert data.count(claim) == 1
+    wrong = data.replace(claim, bytes([4, *changes, 1, 1]) + b"P")
+    assert f"4 samples that change from {changes[0]} to {changes[1]}" in refusal(path, wrong)
+
+
 def test_an_object_inside_itself_is_refused(tmp_path: Path) -> None:
     """Without an endless loop."""
 
@@ -332,9 +341,7 @@ def test_objects_that_share_their_children_are_refused(tmp_path: Path) -> None:
             below = writer.group([0, below, below, writer.data(headers(["a", "b"]))])
         return below
 
-    begin = time.perf_counter()
     assert "overlap" in refusal(tmp_path / "a.abc", archive(None, build=build))
-    assert time.perf_counter() - begin < 5.0
 
 
 def test_deep_nesting_is_read(tmp_path: Path) -> None:
@@ -347,9 +354,7 @@ def test_deep_nesting_is_read(tmp_path: Path) -> None:
             below = writer.group([0, below, writer.data(headers(["name"]))])
         return below
 
-    begin = time.perf_counter()
     assert "has no P" in refusal(tmp_path / "a.abc", archive(None, build=build))
-    assert time.perf_counter() - begin < 10.0
 
 
 @pytest.mark.parametrize("place", [1, 15, 10**6, 2**62, 2**63 - 1])
