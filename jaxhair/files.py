@@ -266,7 +266,8 @@ def check_unit(unit: float, up: str) -> None:
     ):
         wanted = "it must be a number, the file's unit in metres"
         raise ValueError(f"unit is {check.short(unit)}; {wanted}")
-    if not 1e-12 <= unit <= 1e12:
+    value = float(unit) if isinstance(unit, np.floating) else unit  # float16 has no such bounds
+    if not 1e-12 <= value <= 1e12:
         raise ValueError(f"unit is {check.short(unit)}; it must be from 1e-12 to 1e12 metres")
     check.choice("up", up, ("y", "z"))
 

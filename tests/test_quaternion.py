@@ -275,6 +275,21 @@ def test_values_and_gradients_at_zero(dtype: str, mode: object) -> None:
     np.testing.assert_allclose(np.asarray(slopes[1])[:, 1, :, 1], across, atol=tolerance)
 
 
+@DTYPES
+def test_second_gradients_at_zero(dtype: str) -> None:
+    """They are finite: 0 of norm and unit vector, and -1/4 of the exponential's real part."""
+
+    def together(x: jax.Array) -> tuple[jax.Array, ...]:
+        return quat.safe_norm(x), quat.unit(x), quat.from_rotation_vector(x)
+
+    twice = jax.jit(jax.jacfwd(jax.jacrev(together)))(jnp.zeros((3, 1), dtype))
+    norm, unit, exp = (np.asarray(x)[:, 0, :, 0, :, 0] for x in twice)
+    assert not norm.any()
+    assert not unit.any()
+    np.testing.assert_allclose(exp[0], -np.eye(3) / 4, atol=TOLERANCE[dtype])
+    assert not exp[1:].any()
+
+
 def test_rotation_vectors_have_second_derivatives_at_zero() -> None:
     """cos(|v| / 2) is 1 - |v|^2 / 8: a norm guarded at 0 would give 0 in place of -1/4."""
     real = jax.jit(jax.hessian(lambda v: quat.from_rotation_vector(v[:, None])[0, 0]))
