@@ -46,6 +46,7 @@ def system(edges: int, strands: int, dtype: str) -> tuple[Blocks, Any]:
     return blocks, (normal(edges, 3), normal(edges, 3))
 
 
+@jax.jit
 def product(blocks: Blocks, x: Any) -> Any:
     """The matrix times x."""
     n, phi = x
@@ -75,8 +76,8 @@ def dense(blocks: Blocks, strand: int) -> np.ndarray:
 @pytest.mark.parametrize("edges", [1, 2, 3, 12])
 def test_solutions_agree_with_numpy(edges: int, dtype: str) -> None:
     blocks, right = system(edges, 2, dtype)
-    x, factors = solve(blocks, right)
-    again = solve_again(factors, right)
+    x, factors = jax.jit(solve)(blocks, right)
+    again = jax.jit(solve_again)(factors, right)
     for strand in range(2):
         matrix = dense(jax.tree.map(lambda a: a.astype("float64"), blocks), strand)
         np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
@@ -111,15 +112,15 @@ def test_the_matrix_and_the_equations_are_the_same(ragged: bool) -> None:
     inertia = jnp.asarray(1e-3)
     n, phi = (jnp.asarray(rng.normal(size=(6, 3, 3))) for _ in range(2))
     x = jnp.where(at.rod.edge_exists(), n, 0), jnp.where(at.rod.edge_weights > 0, phi, 0)
-    blocks, right = direct.linearised(at, inertia, dt)
+    blocks, right = jax.jit(direct.linearised, static_argnums=2)(at, inertia, dt)
     wanted = jax.tree.map(jnp.subtract, product(blocks, x), right)
-    found = direct.residual(at, inertia, dt, x)
+    found = jax.jit(direct.residual, static_argnums=2)(at, inertia, dt, x)
     if ragged:  # behind a strand's tip nothing is asked of the equations but a solution of 0
         there = at.rod.edge_exists()
         wanted, found = (tuple(jnp.where(there, a, 0) for a in pair) for pair in (wanted, found))
     for a, b in zip(found, wanted, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-11 * float(jnp.abs(b).max()))
-    solved, _ = solve(blocks, right)
+    solved, _ = jax.jit(solve)(blocks, right)
     for part in solved:
         missing = np.broadcast_to(~np.asarray(at.rod.edge_exists()), part.shape)
         assert not np.any(np.asarray(part)[missing])
@@ -129,7 +130,7 @@ def test_the_matrix_bounds_the_true_second_derivative() -> None:
     """matrix - true second derivative of the energy has no negative eigenvalue, nor has matrix."""
     at, dt, _ = known(False, damping=None)
     rod, unit = at.rod, Units.of(at.rod, dt)
-    blocks, _ = direct.linearised(at, jnp.asarray(1e-3), dt)
+    blocks, _ = jax.jit(direct.linearised, static_argnums=2)(at, jnp.asarray(1e-3), dt)
     shape, share = at.rest
     length = rod.lengths / unit.length
 
@@ -144,13 +145,13 @@ def test_the_matrix_bounds_the_true_second_derivative() -> None:
         pull = jnp.where(free, length * quat.dot(at.forces, quat.tangent(q)), 0)
         return jnp.sum(spring * c**2 / 2, axis=(0, 1)) - jnp.sum(pull, axis=(0, 1))
 
+    def of_strand(phi: Any, strand: Any) -> Any:
+        whole = jnp.zeros((6, 3, 3)).at[1:, :, strand].set(phi.reshape(5, 3))
+        return energy(whole)[strand]
+
+    second = jax.jit(jax.hessian(of_strand))
     for strand in range(3):
-
-        def of_strand(phi: Any, strand: int = strand) -> Any:
-            whole = jnp.zeros((6, 3, 3)).at[1:, :, strand].set(phi.reshape(5, 3))
-            return energy(whole)[strand]
-
-        true = np.asarray(jax.hessian(of_strand)(jnp.zeros(15)))
+        true = np.asarray(second(jnp.zeros(15), strand))
         whole = dense(blocks, strand).reshape(6, 6, 6, 6)
         matrix = whole[1:, 3:, 1:, 3:].reshape(15, 15)
         scale = np.abs(matrix).max()
@@ -221,8 +222,15 @@ def test_gradients_agree_with_central_differences_and_between_modes(solver: Any)
             assert found == pytest.approx(float(reverse[name][place]), abs=GRADIENT * scale), name
 
 
-@pytest.mark.parametrize("points", [2, 9, 33, 65, 129])
-@pytest.mark.parametrize("edge", [None, 5e-3], ids=["24 cm", "5 mm apart"])
+@pytest.mark.parametrize(
+    ("points", "edge"),
+    [
+        *((points, None) for points in (2, 33, 129)),
+        *((points, 5e-3) for points in (9, 65)),
+        *(pytest.param(points, None, marks=pytest.mark.slow) for points in (9, 65)),
+        *(pytest.param(points, 5e-3, marks=pytest.mark.slow) for points in (2, 33, 129)),
+    ],
+)
 def test_real_hair_hangs_still_and_unstretched_in_float32(points: int, edge: float | None) -> None:
     """From a horizontal start, real hair's stiffness and weight, the paper's time step."""
     length = 0.24 if edge is None else edge * (points - 1)
@@ -333,10 +341,8 @@ def test_vmap_over_whole_scenes() -> None:
         np.testing.assert_allclose(together[i], end(moduli[i]), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["perm", *(pytest.param(x, marks=pytest.mark.slow) for x in ("bed-hair", "blow-dry"))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["perm", "bed-hair", "blow-dry"])
 def test_the_papers_scenes_with_the_direct_solver(name: str) -> None:
     """Contact, obstacles, wind and winding, real hair's stiffness, float32: hair stays hair."""
     scene = jh.scenes.by_name(name, strands=8, solver=jh.Direct())

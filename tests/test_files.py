@@ -178,7 +178,9 @@ def test_round_trip_keeps_extreme_values(tmp_path, ending):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("unit", [0.01, 0.0254, 1e3, 1e-12, 1e12, np.float32(0.5), np.float16(0.5), 2])
+@pytest.mark.parametrize(
+    "unit", [0.01, 0.0254, 1e3, 1e-12, 1e12, np.float32(0.5), np.float16(0.5), 2]
+)
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_round_trip_in_another_unit(tmp_path, ending, unit, up):
     wanted = strands(4, 7)
