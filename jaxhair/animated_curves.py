@@ -5,7 +5,17 @@ import numpy as np
 from jaxhair import check
 from jaxhair.fibre import PhysicalFibre
 from jaxhair.file_formats import HAIR_DIAMETER
+from jaxhair.recording import Recording
 from jaxhair.scene import Scene
+
+
+def positions_of(recording: Recording) -> np.ndarray:
+    """Points of all frames [m]. Raises ValueError without a frame, or where they are not finite."""
+    if len(recording.phases) == 0:
+        raise ValueError("recording has 0 frames; it must have at least 1")
+    positions = np.asarray(recording.positions)
+    check.finite("positions", positions)
+    return positions
 
 
 def time_codes(times: np.ndarray) -> tuple[np.ndarray, float]:

@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from jaxhair import check, shading
-from jaxhair.animated_curves import bezier_points, boxes, inside, time_codes, widths_of
+from jaxhair.animated_curves import (
+    bezier_points,
+    boxes,
+    inside,
+    positions_of,
+    time_codes,
+    widths_of,
+)
 from jaxhair.extras import optional
 from jaxhair.file_formats import HAIR_DIAMETER
 from jaxhair.files import check_unit, to_unit
@@ -64,10 +71,7 @@ def write(
     check.choice("basis", basis, BASES)
     check.shape("color", color, (3,))
     check.fraction("color", color, many=True)
-    if len(recording.phases) == 0:
-        raise ValueError("recording has 0 frames; it must have at least 1")
-    positions = np.asarray(recording.positions)
-    check.finite("positions", positions)
+    positions = positions_of(recording)
     counts = np.asarray(recording.scene.strands.counts)
     check_unit(unit, up)
     codes, rate = time_codes(np.asarray(recording.times, float))

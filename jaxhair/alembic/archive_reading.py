@@ -23,10 +23,8 @@ from jaxhair.alembic.ogawa import EMPTY_GROUP, Container, is_data
 
 _KEY = 16  # bytes before each sample
 _HASHES = 32  # bytes after the headers of objects
-_SHARED, _SPARE = (
-    2,
-    2**20,
-)  # samples that are read may have so many times the file's bytes, and these
+# samples that are read may have so many times the file's bytes, and these
+_SHARED, _SPARE = 2, 2**20
 _SAME_TIME = 1e-6  # of a cycle, what rounding may take from a time
 
 

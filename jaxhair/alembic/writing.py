@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxhair import check, shading
 from jaxhair.alembic.archive_writing import ACYCLIC, Node, Property, Sampling, write_archive
-from jaxhair.animated_curves import boxes, inside, time_codes, widths_of
+from jaxhair.animated_curves import boxes, inside, positions_of, time_codes, widths_of
 from jaxhair.file_formats import HAIR_DIAMETER
 from jaxhair.files import check_unit, to_unit
 from jaxhair.output import new_file
@@ -67,10 +67,7 @@ def write(
     Raises ValueError for a recording without frames, and FileExistsError.
     """
     check.choice("basis", basis, tuple(BASES))
-    if len(recording.phases) == 0:
-        raise ValueError("recording has 0 frames; it must have at least 1")
-    positions = np.asarray(recording.positions)
-    check.finite("positions", positions)
+    positions = positions_of(recording)
     check_unit(unit, up)
     counts = np.asarray(recording.scene.strands.counts)
     times = np.asarray(recording.times, float)
