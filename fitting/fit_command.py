@@ -91,6 +91,7 @@ def _measured(options: argparse.Namespace) -> Measured:
         return packaged()
     if len(options.target) == 1 and options.target[0].endswith(".toml"):
         return read(options.target[0])
+    files_are = strand_files(options)
     observed: dict[str, Any] = {}
     unnamed = iter(STATES)
     for text in options.target:
@@ -101,7 +102,7 @@ def _measured(options: argparse.Namespace) -> Measured:
                 raise Mistake(f"--target has {len(options.target)} files; at most {len(STATES)}")
         if state in observed:
             raise Mistake(f"--target has {state!r} twice; states must differ")
-        observed[state] = read_curves(path, skip_short=True, **strand_files(options))
+        observed[state] = read_curves(path, skip_short=True, **files_are)
     return from_strands(
         observed,
         rod_diameter=options.rod_diameter,

@@ -17,6 +17,7 @@ bends are too large, as norms are: thin out such strands first (`fitting.resampl
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -39,6 +40,7 @@ class _Chain(NamedTuple):
     has_twist: Array
 
 
+@jax.jit
 def _chain(x: Array) -> _Chain:
     edges = x[1:] - x[:-1]
     lengths, t = quat.safe_norm(edges), quat.unit(edges)
@@ -77,6 +79,12 @@ class Curl(NamedTuple):
 def curl(points: Any) -> Curl:
     """What helix the strands are, see the module's text. Raises ValueError for wrong shapes."""
     x, leading = _columns(points, least=3)
+    return Curl(*(value.reshape(leading) for value in _curl(x)))
+
+
+@jax.jit
+def _curl(x: Array) -> Curl:
+    """`curl` of points of shape (points, 3, strands), each number of shape (strands,)."""
     chain = _chain(x)
     count = jnp.maximum(jnp.sum(chain.lengths > 0, axis=0, dtype=x.dtype), 1)
     edge = jnp.sum(chain.lengths, axis=0) / count
@@ -101,7 +109,7 @@ def curl(points: Any) -> Curl:
         _ratio(2 * jnp.pi * rise, turn),
         count * turn / (2 * jnp.pi),
     )
-    return Curl(*(value[0].reshape(leading) for value in found))
+    return Curl(*(value[0] for value in found))
 
 
 def curl_diameter(points: Any) -> Array:

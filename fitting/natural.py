@@ -203,23 +203,14 @@ def natural(
     if strands is not None:
         check.whole("strands", strands, least=1)
     chosen = np.unique(np.linspace(0, total - 1, min(strands or total, total)).round().astype(int))
-    left: dict[int, str] = {}
-    kept: dict[int, list[np.ndarray]] = {}
-    for i in chosen.tolist():
-        each = [cleaned(x[i]) for x in seen]
-        if bad := [x for x in each if isinstance(x, str)]:
-            left[i] = bad[0]
-        else:
-            kept[i] = [x for x in each if not isinstance(x, str)]
+    kept, left = _sorted_out(seen, chosen.tolist())
     seen_twice: Seen | None = None
     smooth: Iterable[Sequence[np.ndarray]] = kept.values()
     if unloaded is not None and kept:
         seen_twice = Seen.of(*zip(*kept.values(), strict=True))
         smooth = zip(*(x[0] for x in seen_twice.chains(MOST_POINTS)), strict=True)
     whole = np.array([max(turns(x).sum() for x in several) for several in smooth])
-    if points is None:
-        wanted = np.quantile(whole, 0.95) / TURN + 2 if kept else LEAST_POINTS
-        points = int(np.clip(np.ceil(wanted), LEAST_POINTS, MOST_POINTS))
+    points = _needed(whole) if points is None else points
     check.whole("points", points, least=4, most=100_000)
     turn = whole / (points - 2)
     for i, each_turn in zip(list(kept), turn, strict=True):
@@ -269,6 +260,29 @@ def natural(
         resampling,
         seen_twice,
     )
+
+
+def _sorted_out(
+    seen: Sequence[Sequence[Any]], chosen: Sequence[int]
+) -> tuple[dict[int, list[np.ndarray]], dict[int, str]]:
+    """Of the chosen strands, by place: those to be simulated, as often as they were seen, and the
+    reasons why others are left out."""
+    kept: dict[int, list[np.ndarray]] = {}
+    left: dict[int, str] = {}
+    for i in chosen:
+        each = [cleaned(strands[i]) for strands in seen]
+        if bad := [x for x in each if isinstance(x, str)]:
+            left[i] = bad[0]
+        else:
+            kept[i] = [x for x in each if not isinstance(x, str)]
+    return kept, left
+
+
+def _needed(whole: np.ndarray) -> int:
+    """Points with which all but a twentieth of strands that turn by `whole` [rad] turn by at most
+    `TURN` an edge."""
+    wanted = np.quantile(whole, 0.95) / TURN + 2 if len(whole) else LEAST_POINTS
+    return int(np.clip(np.ceil(wanted), LEAST_POINTS, MOST_POINTS))
 
 
 def _refuse_none(kept: Mapping[int, Any], left: dict[int, str]) -> None:

@@ -157,7 +157,7 @@ def recorded(
     return np.asarray(jit(lambda s: lax.scan(one, s, None, length=round(seconds / dt))[1])(state))
 
 
-@pytest.mark.parametrize("time", [0.01, 0.03])
+@pytest.mark.parametrize("time", [pytest.param(0.01, marks=pytest.mark.slow), 0.03])
 def test_damping_is_a_time_and_does_not_depend_on_dt(time: float) -> None:
     """Tip's swing falls by exp(-w^2 T / 2) a second: the ratio of damping is w T / 2.
 

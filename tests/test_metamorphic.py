@@ -14,6 +14,7 @@ from test_invariants import (
     DT,
     EACH,
     SOLVERS,
+    TWO,
     as_dtype,
     assert_same,
     curly,
@@ -67,7 +68,7 @@ def mirrored_frames(q: Any, axis: int) -> np.ndarray:
     return np.asarray(q) * signs.reshape(shape)
 
 
-@EACH
+@TWO
 def test_mirror_image(solver: str) -> None:
     """The scene in a mirror ends in the mirror image."""
     scene = scene_of_3("float64", solver)
@@ -124,7 +125,7 @@ def test_other_units(solver: str) -> None:
     assert_same(end, back, TOLERANCE)
 
 
-@EACH
+@TWO
 def test_a_phase_in_two_pieces(solver: str) -> None:
     """20 steps, or 8 and 12 with the same effects; nothing that moves of itself."""
     scene = scene_of_3("float64", solver)

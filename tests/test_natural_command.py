@@ -191,6 +191,7 @@ def test_mistakes(
     assert {p: p.read_bytes() for p in Path().rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.slow
 def test_ctrl_c_and_going_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
