@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jaxhair.component_sums import component_sum
 from jaxhair.kernels import one_kernel
 from jaxhair.stored import stored
 
@@ -31,7 +32,7 @@ def joined(*parts: Array) -> Array:
 
 def dot(a: Array, b: Array) -> Array:
     """a . b over the component axis, which is kept with size 1."""
-    return jnp.sum(a * b, axis=-2, keepdims=True)
+    return component_sum(a * b)
 
 
 def safe_norm(x: Array) -> Array:
