@@ -14,7 +14,7 @@ import jaxhair as jh
 from jaxhair.treatments import AT_ONCE
 
 FREE_OF_CONTACT = 1e-6  # relative, 300 steps
-IN_CONTACT = 1e-4  # relative, 32 steps
+IN_CONTACT = 1e-4  # relative, 50 steps
 MODES = 1e-9  # forward against reverse, relative
 
 STEPS = 1 / 360
@@ -26,13 +26,13 @@ def hair(strands: int = 2) -> jh.Strands:
 
 
 def perm(numbers: dict[str, Any], contact: bool) -> jh.Scene:
-    """Wound, treated, released into the wind: 300 steps, or 32 with contact and obstacles."""
+    """Wound, treated, released into the wind: 300 steps, or 50 with contact and obstacles."""
     rod = jh.Wound(2 * numbers["rod_radius"], 0.1)
     wind = jh.DryingWind((0.0, -0.3, -0.1), (0.05, 0.3, -0.1), numbers["wind"])
     free: tuple[Any, ...] = (jh.Hold(), jh.Gravity(), jh.Drag(0.2), wind)
     steps = 298
     if contact:
-        steps = 30
+        steps = 48
         free += (
             jh.HairContact(radius=4e-3, strength=20.0),
             jh.Sphere((0.0, 0.05, -0.06), 0.04, 0.3),
