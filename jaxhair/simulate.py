@@ -219,7 +219,7 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
     return tiles.spread(advanced, setup, state, jnp.asarray(first))
 
 
-FEW = 32
+FEW = 64
 """Steps whose states are all stored in reverse mode."""
 
 
@@ -228,7 +228,8 @@ def _advanced(setup: Setup, state: State, first: Array, *, steps: int) -> State:
 
     Two nested scans: in reverse mode about 2 sqrt(steps) states are stored, and each step is
     computed a second and third time instead; the third time only where the solver's iterations
-    are not. Of `FEW` steps all states are stored: a time and a fifth of the compilation less.
+    are not. Of `FEW` steps all states are stored: a forward run and a fifth of the compilation
+    less.
     """
 
     def one(carry: Any, number: Array) -> tuple[Any, None]:
