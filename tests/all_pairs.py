@@ -10,7 +10,10 @@ from jax import Array, lax
 
 from jaxhair import HairContact, State
 from jaxhair import quaternion as quat
+from jaxhair.contact import Lists
 from jaxhair.rods import Rod
+
+CHUNK = 2**15  # pairs computed together
 
 
 def velocity_change(contact: HairContact, rod: Rod, state: State, dt: float) -> Array:
@@ -46,3 +49,26 @@ def push(p: Array, start: Array, end: Array, radius: Any) -> Array:
     apart = jnp.where(nowhere, 0, apart)
     depth = jnp.maximum(1 - quat.safe_norm(apart) / (2 * radius), 0)
     return jnp.moveaxis(depth * quat.unit(apart), -2, 1)
+
+
+def listed(state: State, strands: Any) -> Lists:
+    """Lists of all points of some strands with all edges of all others.
+
+    With them `HairContact.recalled_change` computes each pair as it always does, rounding
+    included, so that nothing but the order of sums may differ from what lists of neighbours give.
+    """
+    points, _, count = state.positions.shape
+    at = (np.arange(points)[:, None] * count + np.asarray(strands)).ravel()
+    at, edges = np.meshgrid(at, np.arange((points - 1) * count), indexing="ij")
+    of_others = at % count != edges % count
+    at, edges = at[of_others], edges[of_others]
+    left = -at.size % CHUNK
+    at, edges = (
+        jnp.asarray(np.pad(x, (0, left), constant_values=points * count), jnp.int32)
+        for x in (at, edges)
+    )
+    x, number = state.positions, jnp.int32(at.size - left)
+    return Lists(
+        at.reshape(-1, CHUNK), edges.reshape(-1, CHUNK), number, jnp.full((), jnp.inf, x.dtype), x,
+        jnp.int32(1),
+    )  # fmt: skip

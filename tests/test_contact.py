@@ -18,6 +18,7 @@ from jaxhair.simulate import Setup, advance, blank, prepare, remembering_step, s
 # Relative to the largest push. Float32 rounds the direction between hairs that nearly coincide.
 AGREES = {"float64": 1e-12, "float32": 5e-5}
 SLOPES = 1e-6  # against central differences, relative to the largest
+SUMS = 1e-6  # the same pushes of float32, summed in another order
 DT = 1 / 360
 
 
@@ -84,6 +85,18 @@ def test_the_same_as_all_pairs(radius: float, ragged: bool, dtype: str) -> None:
     for seed in range(3):
         strands = hair(seed=seed, ragged=ragged, dtype=dtype)
         assert_same(*both(*prepared(strands, contact)[:2]))
+
+
+def test_nothing_but_the_order_of_sums_differs_from_all_pairs_in_float32() -> None:
+    setup, state, contact = prepared(
+        hair(60, dtype="float32"), jh.HairContact(2e-3, 20.0, capacity=64)
+    )
+    pushed = jax.jit(contact.recalled_change)
+    ours = pushed(setup.rod, state, DT, renewed(contact, setup, state))
+    theirs = pushed(setup.rod, state, DT, all_pairs.listed(state, np.arange(60)))
+    most = np.abs(theirs).max()
+    assert most > 0
+    assert np.abs(ours - theirs).max() <= SUMS * most
 
 
 def test_many_strands() -> None:

@@ -2,8 +2,9 @@
 
 Contact alone, for more and more strands that sway by 2 cm at the same density: time of a step with
 lists of neighbours and with all pairs, how often lists were made, and the largest difference of
-pushes. Then a step of the paper's scenes with and without contact. Float32, the least of some
-repeats, compilation apart.
+pushes from all pairs: from the same pushes of float32, of which only the sums have another order,
+and from pushes computed in float64. Then a step of the paper's scenes with and without contact.
+Float32, the least of some repeats, compilation apart.
 """
 
 import argparse
@@ -71,12 +72,28 @@ def pushes(setup: Setup, state: jh.State, steps: int, every_pair: bool = False) 
     return lax.scan(one, (zero, zero, lists), jnp.arange(steps, dtype="float32"))[0]
 
 
+def _some(strands: int, number: int) -> np.ndarray:
+    """Some of the strands, each once."""
+    return np.random.default_rng(1).choice(strands, min(number, strands), replace=False)
+
+
+def of_sums(setup: Setup, state: jh.State, steps: int, found: Any, samples: int = 10) -> float:
+    """As `difference`, but of the same pushes of float32, with all edges in the lists."""
+    contact = of_kind(setup.effects, jh.HairContact)[0]
+    now = swaying(state, jnp.float32(steps - 1))
+    some = _some(now.positions.shape[2], samples)
+    pairs = all_pairs.listed(now, some)
+    theirs = jax.jit(contact.recalled_change)(setup.rod, now, DT, pairs)
+    off = np.abs(theirs - found[1])[..., some].max()
+    return float(off / np.abs(found[1]).max())
+
+
 def difference(state: jh.State, steps: int, found: Any, samples: int = 100) -> float:
     """Largest difference of the last step's pushes from those of all pairs, computed in float64 for
     some strands, over the largest push."""
     x = np.asarray(swaying(state, jnp.float32(steps - 1)).positions, float)
     strands = x.shape[2]
-    some = np.random.default_rng(1).choice(strands, min(samples, strands), replace=False)
+    some = _some(strands, samples)
     ours, worst = np.asarray(found[1], float), 0.0
     along = x[1:] - x[:-1]
     for strand in some:
@@ -95,7 +112,7 @@ def difference(state: jh.State, steps: int, found: Any, samples: int = 100) -> f
 def alone(sizes: list[int], steps: int, repeats: int) -> None:
     """Prints what contact alone costs."""
     print(f"\ncontact alone, {steps} steps of strands of 9 points at one density")
-    print("  strands   ms a step   all pairs   ratio   steps a list   difference")
+    print("  strands   ms a step   all pairs   ratio   steps a list   off: sums   float64")
     times = []
     for strands in sizes:
         scene = patch(strands)
@@ -109,9 +126,9 @@ def alone(sizes: list[int], steps: int, repeats: int) -> None:
             slow = min(wall_times(partial(pushes, setup, state, 4, True), 3)) * 1e3 / 4
             pairs, ratio = f"{slow:.2f}", f"{slow / taken:.1f}"
         made = int(found[2].builds)
-        off = difference(state, steps, found)
+        sums, off = of_sums(setup, state, steps, found), difference(state, steps, found)
         print(f"  {strands:7d}   {taken:9.3f}   {pairs:>9}   {ratio:>5}   {steps / made:12.1f}   "
-              f"{off:10.1e}", flush=True)  # fmt: skip
+              f"{sums:9.1e} {off:9.1e}", flush=True)  # fmt: skip
     slope = np.polyfit(np.log(sizes), np.log(times), 1)[0]
     ends = np.log(times[-1] / times[0]) / np.log(sizes[-1] / sizes[0])
     print(f"  exponent: {ends:.3f} from the first to the last, {slope:.3f} by least squares")
