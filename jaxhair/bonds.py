@@ -15,6 +15,7 @@ from jaxhair.pytree import pytree
 from jaxhair.rods import Rod
 from jaxhair.stored import once, stored
 from jaxhair.strands import BONDS, State
+from jaxhair.sums import spread, summed
 
 TINY = 2.0**-60
 """Below it the slope of 1 / x, which is x^-2, comes near what float32 holds."""
@@ -72,14 +73,14 @@ def rest_shape(shapes: Array, fractions: Array, influence: Array, r: Array) -> A
         r: conj(q1) q2, whose vector part is Omega, shape (inner points, 4, strands).
     Returns Omega_o, shape (inner points, 3, strands).
     """
-    share = influence / jnp.sum(influence, axis=1, keepdims=True)
+    share = influence / spread(summed(influence), len(BONDS))
     r = stored(r)
     held = []
     shape, fraction, part = map(_of_kind, (shapes, fractions, share))
     for j in range(len(BONDS)):
         kept, cut = shape(j), 1 - fraction(j)[:, None]
         bent = stored(present_shape(r, kept)) - kept
-        held.append(part(j)[:, None] * (kept + cut * bent))
+        held.append(quat.scaled(kept + quat.scaled(bent, cut), part(j)[:, None]))
     return sum(held[1:], held[0])
 
 
@@ -96,13 +97,13 @@ def springs(shapes: Array, fractions: Array, influence: Array) -> tuple[Array, A
     points, 1, strands).
     """
     bonded = influence * fractions
-    whole = jnp.sum(bonded, axis=1, keepdims=True)
-    share = whole / jnp.sum(influence, axis=1, keepdims=True)
+    whole = summed(bonded)
+    share = whole / summed(influence)
     cut = share <= _nothing(share)
     share = share - jnp.where(cut, lax.stop_gradient(share), 0)  # 0 if cut, with its slope
     part, one = _of_kind(bonded), _of_kind(shapes)
-    each = [part(j)[:, None] * one(j) for j in range(len(BONDS))]
-    shape = sum(each[1:], each[0]) / jnp.where(cut, 1, whole)
+    each = [quat.scaled(one(j), part(j)[:, None]) for j in range(len(BONDS))]
+    shape = sum(each[1:], each[0]) / spread(jnp.where(cut, 1, whole), 3)
     return quat.from_vector_part(shape), share
 
 
@@ -140,7 +141,7 @@ def remembered(shape: Array, fraction: Array, rise: Array, r: Array) -> Array:
     """
     rises = (rise > 0) & (fraction + rise > _nothing(fraction))
     new = jnp.where(rises, rise / jnp.where(rises, fraction + rise, 1), 0)[:, None]
-    return shape + new * (present_shape(r, shape) - shape)
+    return shape + quat.scaled(present_shape(r, shape) - shape, new)
 
 
 def changes(

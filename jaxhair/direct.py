@@ -16,6 +16,7 @@ from jaxhair.rods import Rod
 from jaxhair.solvers import Solver
 from jaxhair.stored import stored
 from jaxhair.strands import State
+from jaxhair.sums import POINTS, spread, summed
 
 
 @pytree
@@ -191,15 +192,15 @@ def _shortened(rod: Rod, unit: Units, p: Array, n: Array) -> Array:
     """
     edge = p[1:] - p[:-1]
     allowed = rod.lengths / unit.length * (1.1 + unit.compliance * quat.safe_norm(n))
-    excess = jnp.maximum(quat.safe_norm(edge) - allowed, 0) * quat.unit(edge)
+    excess = quat.scaled(quat.unit(edge), jnp.maximum(quat.safe_norm(edge) - allowed, 0))
     pulled = padded(lax.associative_scan(jnp.add, excess), 1, 0)  # `cumsum` fits no kernel
     w = rod.point_weights
     free = w > 0
     mass = jnp.where(free, 1 / jnp.where(free, w, 1), 1e6)
     if rod.ragged:
         mass = jnp.where(rod.point_exists(), mass, 0)
-    mean = jnp.sum(mass * pulled, axis=0, keepdims=True) / jnp.sum(mass, axis=0, keepdims=True)
-    return p + jnp.where(free, mean - pulled, 0)
+    mean = summed(mass * pulled, POINTS) / summed(mass, POINTS)
+    return p + jnp.where(free, spread(mean, len(p), POINTS) - pulled, 0)
 
 
 def _rotation(phi: Array) -> Array:
@@ -222,7 +223,7 @@ def _turned(rod: Rod, p: Array, change: Array, length: Array, q: Array) -> Array
     q = stored(q)
     axis = stored(quat.tangent(q))
     across = change[1:] - change[:-1]
-    edge = stored(p[1:] - p[:-1] + across - quat.dot(across, axis) * axis)
+    edge = stored(p[1:] - p[:-1] + across - quat.scaled(axis, quat.dot(across, axis)))
     missing = jnp.maximum(length / 2 - quat.safe_norm(edge), 0)
-    turn = quat.between(axis, stored(quat.unit(stored(edge + missing * axis))))
+    turn = quat.between(axis, stored(quat.unit(stored(edge + quat.scaled(axis, missing)))))
     return jnp.where(rod.edge_weights > 0, quat.unit(stored(quat.multiply(stored(turn), q))), q)

@@ -17,6 +17,7 @@ from jax import Array
 from jaxhair import quaternion as quat
 from jaxhair import rods
 from jaxhair.block_tridiagonal import matrix_product
+from jaxhair.kernels import one_kernel
 from jaxhair.rods import Rod
 from jaxhair.stored import stored
 
@@ -62,18 +63,24 @@ def joints(rod: Rod, unit: Units, before: Array, q: Array, rest: Any, dt: float)
         rest: shape and share of `jaxhair.bonds.springs`.
     """
     shape, share = rest
-    spring = share * rod.bending() / (unit.force * unit.length)
-    spring, shape = rods.damped(rod, spring, shape, before, dt)
+    whole = rod.bending() / (unit.force * unit.length)  # of all bonds, and without damping
+    share, shape = rods.damped(rod, share, shape, before, dt)
+    spring = quat.scaled(whole, share)
     r = rods.joints(q)
     r = stored(quat.same_hemisphere(r, shape) * r)
     moment = stored(spring * (r - shape)[:, 1:])
-    weakest = jnp.min(spring, axis=1, keepdims=True)
+    weakest, strongest = (share * f(whole, axis=1, keepdims=True) for f in (jnp.min, jnp.max))
+    return Joints(r, spring, moment, _cover(r, moment, weakest, strongest))
+
+
+@one_kernel
+def _cover(r: Array, moment: Array, weakest: Array, strongest: Array) -> Array:
+    """X, see `joint_matrices`; of the springs at each joint, the weakest and the strongest."""
     bent = jnp.where(weakest > 0, quat.dot(moment, moment) / jnp.where(weakest > 0, weakest, 1), 0)
-    rounding = 32 * np.finfo(q.dtype).eps * jnp.max(spring, axis=1, keepdims=True)
+    rounding = 32 * np.finfo(r.dtype).eps * strongest
     # |m| |Omega|, rounded off at its tip: at rest m is rounding, and so would be its direction
-    across = quat.safe_norm(jnp.concatenate([moment * quat.safe_norm(r[:, 1:]), rounding], axis=1))
-    cover = bent / 4 + across
-    return Joints(r, spring, moment, cover)
+    across = quat.scaled(moment, quat.safe_norm(r[:, 1:]))
+    return bent / 4 + quat.safe_norm(jnp.concatenate([across, rounding], axis=1))
 
 
 def joint_moments(joints: Joints, phi1: Array, phi2: Array) -> tuple[Array, Array]:
@@ -84,10 +91,10 @@ def joint_moments(joints: Joints, phi1: Array, phi2: Array) -> tuple[Array, Arra
     """
     w, v = joints.turn[:, :1], joints.turn[:, 1:]
     both = phi1 + phi2
-    change = (w * (phi2 - phi1) + quat.cross(v, both)) / 2
+    change = (quat.scaled(phi2 - phi1, w) + quat.cross(v, both)) / 2
     m = joints.moment + joints.spring * change
     first, second = acting(joints, m)
-    held, twisted = joints.cover * both / 4, w * joints.moment / 4
+    held, twisted = quat.scaled(both, joints.cover) / 4, quat.scaled(joints.moment, w) / 4
     return (
         first + held + quat.cross(twisted, phi2),
         second + held - quat.cross(twisted, phi1),
@@ -96,7 +103,8 @@ def joint_moments(joints: Joints, phi1: Array, phi2: Array) -> tuple[Array, Arra
 
 def acting(joints: Joints, moment: Array) -> tuple[Array, Array]:
     """What moments m at the joints do to the edges before and after them, -a m and a' m."""
-    direct, across = joints.turn[:, :1] * moment / 2, quat.cross(joints.turn[:, 1:], moment) / 2
+    w, v = joints.turn[:, :1], joints.turn[:, 1:]
+    direct, across = quat.scaled(moment, w) / 2, quat.cross(v, moment) / 2
     return -direct - across, direct - across
 
 

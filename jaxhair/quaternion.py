@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxhair.component_sums import component_sum
 from jaxhair.kernels import one_kernel
 from jaxhair.stored import stored
+from jaxhair.sums import spread, summed
 
 
 def components(x: Array) -> Sequence[Array]:
@@ -32,7 +32,18 @@ def joined(*parts: Array) -> Array:
 
 def dot(a: Array, b: Array) -> Array:
     """a . b over the component axis, which is kept with size 1."""
-    return component_sum(a * b)
+    return summed(a * b)
+
+
+def scaled(x: Array, factor: Array) -> Array:
+    """factor x, with a factor for each vector, component axis of size 1, or for each component.
+
+    In reverse mode the factor's derivative is a `dot`; see `jaxhair.sums`.
+    """
+    if factor.ndim > 1 and factor.shape[-2] == 1:
+        shape = jnp.broadcast_shapes(factor.shape, x.shape)
+        factor = spread(jnp.broadcast_to(factor, (*shape[:-2], 1, shape[-1])), shape[-2])
+    return factor * x
 
 
 def safe_norm(x: Array) -> Array:
@@ -54,7 +65,7 @@ def _unit_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     (x,), (dx,) = primals, tangents
     inverse = _inverse_norm(x)
     u, turned = x * inverse, dx * inverse
-    return u, turned - u * dot(u, turned)
+    return u, turned - scaled(u, dot(u, turned))
 
 
 @one_kernel
@@ -133,7 +144,7 @@ def rotate(q: Array, v: Array) -> Array:
     """R(q) v for a unit quaternion."""
     axis = q[..., 1:, :]
     twice = 2 * cross(axis, v)
-    return v + q[..., :1, :] * twice + cross(axis, twice)
+    return v + scaled(twice, q[..., :1, :]) + cross(axis, twice)
 
 
 def from_rotation_vector(v: Array) -> Array:
@@ -148,7 +159,8 @@ def from_rotation_vector(v: Array) -> Array:
     cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
     sinc = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))))
     w = jnp.where(small, cosine, jnp.cos(half))
-    return jnp.concatenate([w, v / 2 * jnp.where(small, sinc, jnp.sin(half) / half)], axis=-2)
+    part = scaled(v / 2, jnp.where(small, sinc, jnp.sin(half) / half))
+    return jnp.concatenate([w, part], axis=-2)
 
 
 def between(a: Array, b: Array) -> Array:

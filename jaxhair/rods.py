@@ -168,8 +168,9 @@ def stretch_shear_moved(
     g1, g2, gq = factors
     w, x, y, z = quat.components(q)
     q_conj_e = quat.joined(z, -y, x, -w)
-    turn = quat.vector_multiply(gq * gamma, q_conj_e)
-    return p1 + g1 * gamma, p2 - g2 * gamma, quat.unit(stored(q + turn))
+    turn = quat.vector_multiply(quat.scaled(gamma, gq), q_conj_e)
+    moved1, moved2 = quat.scaled(gamma, g1), quat.scaled(gamma, g2)
+    return p1 + moved1, p2 - moved2, quat.unit(stored(q + turn))
 
 
 def bend_twist_factors(w1: Array, w2: Array, stiffness: Array) -> tuple[Array, Array]:
@@ -247,6 +248,6 @@ def bend_twist_moved(
 ) -> tuple[Array, Array]:
     """The corrections of `bend_twist` for a given violation."""
     h1, h2 = factors
-    new1 = quat.unit(stored(q1 + quat.multiply_vector(q2, h1 * c)))
-    new2 = quat.unit(stored(q2 - quat.multiply_vector(q1, h2 * c)))
+    new1 = quat.unit(stored(q1 + quat.multiply_vector(q2, quat.scaled(c, h1))))
+    new2 = quat.unit(stored(q2 - quat.multiply_vector(q1, quat.scaled(c, h2))))
     return new1, new2
