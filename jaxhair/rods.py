@@ -202,7 +202,8 @@ def damped(rod: Rod, spring: Array, shape: Array, before: Array, dt: Any) -> tup
     Without a damping time T, spring and shape as they are. Needs a material.
 
     Arguments:
-        spring: shape (points - 2, 3, strands or 1). shape: unit quaternions, (points - 2, 4, ...).
+        spring: shape (points - 2, 3 or 1, strands or 1). shape: unit quaternions, (points - 2, 4,
+            strands or 1).
         before: orientations at the start of the step, shape (points - 1, 4, strands).
     """
     time = None if rod.material is None else rod.material.damping_time

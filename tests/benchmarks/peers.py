@@ -48,14 +48,19 @@ def scene(strands: int, points: int, solver: Any) -> jh.Scene:
     return jh.Scene(hair, bonds=bonds, phases=(jh.Phase("fall", 1.0, effects),), solver=solver)
 
 
-def least(call: Callable[[], Any]) -> float:
-    """Seconds of the fastest of many calls, but for the first."""
-    times: list[float] = []
-    while len(times) < 5 or (len(times) < 200 and sum(times) < 3):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - begin)
-    return min(times[1:])
+def least(*calls: Callable[[], Any]) -> list[float]:
+    """Seconds of the fastest of many runs of each call, which take turns; the first does not count.
+
+    In turn, because the ratio of two calls should not tell what else the machine did meanwhile.
+    """
+    times: list[list[float]] = []
+    while len(times) < 5 or (len(times) < 200 and np.sum(times) < 3 * len(calls)):
+        times.append([])
+        for call in calls:
+            begin = time.perf_counter()
+            jax.block_until_ready(call())
+            times[-1].append(time.perf_counter() - begin)
+    return [float(x) for x in np.min(times[1:], axis=0)]
 
 
 def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tuple[float, float]:
@@ -67,7 +72,7 @@ def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tup
     run = jax.jit(lambda *x: phase_end(*x, steps=steps, kernels=True), compiler_options=options)
     program = run.lower(bare, effects, state).compile()
     compilation = time.perf_counter() - begin
-    return 1e6 * least(lambda: program(bare, effects, state)) / steps, compilation
+    return 1e6 * least(lambda: program(bare, effects, state))[0] / steps, compilation
 
 
 def our_gradient(strands: int, points: int, solver: Any) -> tuple[float, float]:
@@ -81,8 +86,11 @@ def our_gradient(strands: int, points: int, solver: Any) -> tuple[float, float]:
         return jnp.sum(along * end.positions)
 
     gradient = jax.jit(jax.value_and_grad(loss))
-    forward = least(lambda: phase_end(bare, effects, state, steps=STEPS, kernels=True))
-    return 1e6 * forward / STEPS, 1e6 * least(lambda: gradient(state.shapes)) / STEPS
+    forward, both = least(
+        lambda: phase_end(bare, effects, state, steps=STEPS, kernels=True),
+        lambda: gradient(state.shapes),
+    )
+    return 1e6 * forward / STEPS, 1e6 * both / STEPS
 
 
 def printed(python: str, program: Path, options: list[str], pattern: str) -> float | None:
@@ -143,12 +151,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("peers", type=Path, help="folder with scene/ and numba/")
     parser.add_argument("--python", default=sys.executable, help="an interpreter with numba")
+    parser.add_argument("--only", choices=("steps", "gradients"))
     options = parser.parse_args()
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}; microseconds a step")
-    for strands, points in SIZES:
+    for strands, points in SIZES if options.only != "gradients" else ():
         print(f"\n{strands:,} strands of {points} points")
         steps(options, strands, points)
-    for strands, points in GRADIENTS:
+    for strands, points in GRADIENTS if options.only != "steps" else ():
         print(f"\ngradient, {strands:,} strands of {points} points, {STEPS} steps")
         gradients(options, strands, points)
 
