@@ -24,7 +24,7 @@ from jaxhair.simulate import phase_end, prepare, start
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from contact import patch, pushes
-from measure import wall_times
+from measure import in_turn
 
 POINTS = 32
 SIZES = (100, 1_000, 10_000, 100_000, 1_000_000)
@@ -64,7 +64,7 @@ def bandwidth() -> float:
     """Bytes a second that a large copy reads and writes."""
     x = jnp.ones(2**28 if jax.default_backend() != "cpu" else 2**25, "float32")
     double = jax.jit(lambda x: 2 * x)
-    return 2 * x.nbytes / min(wall_times(lambda: double(x), 10))
+    return 2 * x.nbytes / in_turn(lambda: double(x), times=10).min()
 
 
 def throughput(sizes: tuple[int, ...], most: float = 2.0) -> None:
@@ -79,8 +79,7 @@ def throughput(sizes: tuple[int, ...], most: float = 2.0) -> None:
     print(f"   ({len(keys)} programs traced and compiled in {time.perf_counter() - begin:.0f} s)")
     for n, name in keys:
         run = runs.pop((n, name))
-        once = min(wall_times(run, 1))
-        taken = min([once, *wall_times(run, int(np.clip(most / once, 2, 20)))]) / steps[n]
+        taken = in_turn(run, times=20, least=3, longest=most).min() / steps[n]
         state = sum(x.nbytes for x in jax.tree.leaves(run()))
         print(
             f"  {n:8d}  {name:<10}  {1e6 * taken:9.0f}  {1e9 * taken / n / POINTS:10.3f}"
@@ -115,7 +114,7 @@ def touching(sizes: tuple[int, ...], steps: int = 60) -> None:
         built = patch(strands)
         setup, state = prepare(built, built.phases[0].effects), start(built)
         found = pushes(setup, state, steps)
-        taken = min(wall_times(partial(pushes, setup, state, steps), 3)) / steps
+        taken = in_turn(partial(pushes, setup, state, steps), times=3).min() / steps
         print(
             f"  {strands:7d}   {1e3 * taken:9.2f}   {steps / int(found[2].builds):.1f}", flush=True
         )
@@ -137,9 +136,8 @@ def derivatives() -> None:
             at = jnp.asarray(built.bonds.influence)
             programs = {"plain": loss, "reverse": jax.grad(loss), "forward": jax.jacfwd(loss)}
             compiled = side_by_side({k: jax.jit(f).lower(at).compile for k, f in programs.items()})
-            plain, reverse, forward = (
-                min(wall_times(partial(f, at), 5)) for f in compiled.values()
-            )
+            calls = [partial(f, at) for f in compiled.values()]
+            plain, reverse, forward = in_turn(*calls, times=5).min(axis=0)
             print(
                 f"  {strands:6d} x {points}  {name:<10}  run {1e3 * plain:7.1f} ms, reverse "
                 f"{reverse / plain:.1f}, forward in 4 numbers {forward / plain:.1f}",
@@ -151,7 +149,7 @@ def scenes() -> None:
     """Prints the time of a step in the last phase of the paper's scenes."""
     print("\nthe paper's scenes, last phase: us a step (times real time at 1/360 s)")
     for name, make in jh.scenes.SCENES.items():
-        taken = min(wall_times(stepping(make(), 60), 3)) / 60
+        taken = in_turn(stepping(make(), 60), times=3).min() / 60
         print(f"  {name:<9}  {1e6 * taken:6.0f}  {1 / 360 / taken:.1f}x", flush=True)
 
 

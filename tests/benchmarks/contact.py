@@ -25,7 +25,7 @@ from jaxhair.simulate import Setup, blank, phase_end, prepare, remembering_step,
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import all_pairs
-from measure import wall_times
+from measure import in_turn
 
 DT = 1 / 360
 CONTACT = jh.HairContact(radius=1e-3, strength=20.0)
@@ -119,11 +119,11 @@ def alone(sizes: list[int], steps: int, repeats: int) -> None:
         setup, state = prepare(scene, scene.phases[0].effects), start(scene)
         found = pushes(setup, state, steps)
         few = repeats if strands < 5000 else 2
-        taken = 1e3 * min(wall_times(partial(pushes, setup, state, steps), few)) / steps
+        taken = 1e3 * in_turn(partial(pushes, setup, state, steps), times=few).min() / steps
         times.append(taken)
         pairs = ratio = "-"
         if strands <= 600:
-            slow = min(wall_times(partial(pushes, setup, state, 4, True), 3)) * 1e3 / 4
+            slow = 1e3 * in_turn(partial(pushes, setup, state, 4, True), times=3).min() / 4
             pairs, ratio = f"{slow:.2f}", f"{slow / taken:.1f}"
         made = int(found[2].builds)
         sums, off = of_sums(setup, state, steps, found), difference(state, steps, found)
@@ -147,7 +147,7 @@ def in_scenes(repeats: int) -> None:
             free = tuple(e for e in phase.effects if not isinstance(e, jh.HairContact))
             for effects in (free, phase.effects):
                 run = partial(phase_end, bare, effects, state, steps=60, kernels=True)
-                taken.append(1e3 * min(wall_times(run, repeats)) / 60)
+                taken.append(1e3 * in_turn(run, times=repeats).min() / 60)
             made, skin = memory_after(prepare(bare, phase.effects), state, 60)
             print(f"  {name:<9} {phase.name:<12} {taken[0]:9.3f}   {taken[1]:12.3f}   "
                   f"{60 / made:12.1f}   {1e3 * skin:9.1f}", flush=True)  # fmt: skip

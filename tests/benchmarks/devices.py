@@ -5,13 +5,13 @@ calls that take turns, compilation apart. Then the exponent of time against stra
 where time grows in proportion.
 """
 
-import time
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
 
 import jax
 import numpy as np
+from measure import in_turn
 
 import jaxhair as jh
 from jaxhair import tiles
@@ -43,18 +43,11 @@ def steps(strands: int, points: int, devices: int, whole: bool) -> tuple[Callabl
     return lambda: compiled(scene), number
 
 
-def in_turn(runs: list[tuple[Callable[[], Any], int]]) -> np.ndarray:
+def least(simulations: list[tuple[Callable[[], Any], int]]) -> np.ndarray:
     """Least time of a step [us] of each."""
-    least = np.full(len(runs), np.inf)
-    for run, _ in runs:
-        jax.block_until_ready(run())
-    begin = time.perf_counter()
-    while time.perf_counter() - begin < SECONDS:
-        for i, (run, number) in enumerate(runs):
-            before = time.perf_counter()
-            jax.block_until_ready(run())
-            least[i] = min(least[i], 1e6 * (time.perf_counter() - before) / number)
-    return least
+    runs, numbers = zip(*simulations, strict=True)
+    taken = in_turn(*runs, times=10_000, longest=SECONDS).min(axis=0)
+    return 1e6 * taken / np.array(numbers)
 
 
 def exponents(sizes: tuple[int, ...], taken: np.ndarray) -> str:
@@ -70,14 +63,14 @@ def main() -> None:
     for strands, points in SIZES:
         kinds = {"1, whole": (1, True), "1, tiles": (1, False)}
         kinds |= {"2, whole": (2, True), "2, tiles": (2, False)}
-        taken = in_turn([steps(strands, points, *kind) for kind in kinds.values()])
+        taken = least([steps(strands, points, *kind) for kind in kinds.values()])
         for kind, x in zip(kinds, taken, strict=True):
             print(f"  {strands:6d} x {points:3d}  {kind}  {x:8.0f}  {x / taken[0]:.2f}", flush=True)
     for name, numbers, sizes in (
         ("strands, 9 points", STRANDS, [(n, 9) for n in STRANDS]),
         ("points, 64 strands", POINTS, [(64, n) for n in POINTS]),
     ):
-        taken = in_turn([steps(*size, 1, False) for size in sizes])
+        taken = least([steps(*size, 1, False) for size in sizes])
         each = ", ".join(f"{n}: {x:.0f} us" for n, x in zip(numbers, taken, strict=True))
         print(f"{name}  {each}\n  exponent {exponents(numbers, taken)}", flush=True)
 

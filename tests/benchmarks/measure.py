@@ -17,20 +17,32 @@ import jaxhair as jh
 from jaxhair.simulate import phase_end, start
 
 
-def wall_times(run: Callable[[], Any], times: int) -> list[float]:
-    """Of calls [s], after one that compiles."""
-    jax.block_until_ready(run())
-    taken = []
-    for _ in range(times):
-        begin = time.perf_counter()
+def in_turn(
+    *runs: Callable[[], Any], times: int = 200, longest: float = np.inf, least: int = 4
+) -> np.ndarray:
+    """Wall times of calls [s], shape (times, runs), after one of each that compiles.
+
+    They take turns, because a ratio of two should not tell what else the machine did meanwhile.
+
+    Arguments:
+        times: each call is made. longest: that all may take [s], once each was made `least` times.
+    """
+    for run in runs:
         jax.block_until_ready(run())
-        taken.append(time.perf_counter() - begin)
-    return taken
+    taken: list[list[float]] = []
+    since = time.perf_counter()
+    while len(taken) < times and (len(taken) < least or time.perf_counter() - since < longest):
+        taken.append([])
+        for run in runs:
+            begin = time.perf_counter()
+            jax.block_until_ready(run())
+            taken[-1].append(time.perf_counter() - begin)
+    return np.array(taken)
 
 
 def seconds(run: Callable[[], Any], times: int = 5) -> float:
     """Median wall time of a call, after one that compiles."""
-    return float(np.median(wall_times(run, times)))
+    return float(np.median(in_turn(run, times=times)))
 
 
 def stretch(points: int, edge: float, iterations: int) -> float:

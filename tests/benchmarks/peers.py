@@ -3,7 +3,8 @@
 PEERS is the folder of the peers' programs, each of which simulates the same scene: strands clamped
 at their roots, gravity, 5 iterations, a rest shape of four bonds, of which two kinds re-form.
 PYTHON is an interpreter that has numba, if this one does not. Microseconds a step, the least of
-many runs, float32, compilation apart; ratios to vectorised Numba on as many threads. Also a
+many runs, float32, compilation apart; ratios to vectorised Numba. "512 bits" are the vectors that
+the compiler option `xla_cpu_prefer_vector_width` asks for, where a processor has them. Also a
 reverse-mode gradient, forward run included, beside that of Warp's tape if PYTHON has warp-lang.
 """
 
@@ -13,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from measure import in_turn
 
 import jaxhair as jh
 from jaxhair.simulate import phase_end, start
@@ -34,6 +35,7 @@ SOLVERS = {
 }
 GRADIENTS = ((200, 9), (64, 33))
 STEPS = 60  # that a gradient goes back
+SECONDS = 3.0  # of each comparison
 OTHERS = {"numba, vectorised": "nb_flat.py", "numba, plain": "nb_rods.py"}
 
 
@@ -48,31 +50,25 @@ def scene(strands: int, points: int, solver: Any) -> jh.Scene:
     return jh.Scene(hair, bonds=bonds, phases=(jh.Phase("fall", 1.0, effects),), solver=solver)
 
 
-def least(*calls: Callable[[], Any]) -> list[float]:
-    """Seconds of the fastest of many runs of each call, which take turns; the first does not count.
-
-    In turn, because the ratio of two calls should not tell what else the machine did meanwhile.
-    """
-    times: list[list[float]] = []
-    while len(times) < 5 or (len(times) < 200 and np.sum(times) < 3 * len(calls)):
-        times.append([])
-        for call in calls:
-            begin = time.perf_counter()
-            jax.block_until_ready(call())
-            times[-1].append(time.perf_counter() - begin)
-    return [float(x) for x in np.min(times[1:], axis=0)]
-
-
-def ours(strands: int, points: int, solver: Any, options: dict[str, Any]) -> tuple[float, float]:
+def ours(
+    strands: int, points: int, solver: Any, devices: int, options: dict[str, Any]
+) -> tuple[float, float]:
     """Microseconds a step, and seconds of tracing and compiling."""
     built = scene(strands, points, solver).as_arrays()
     effects, state, bare = built.phases[0].effects, start(built), replace(built, phases=())
     steps = int(np.clip(400_000 / (strands * points), 20, 100))
     begin = time.perf_counter()
-    run = jax.jit(lambda *x: phase_end(*x, steps=steps, kernels=True), compiler_options=options)
+    run = jax.jit(
+        lambda *x: phase_end(*x, steps=steps, devices=devices, kernels=True),
+        compiler_options=options,
+    )
     program = run.lower(bare, effects, state).compile()
     compilation = time.perf_counter() - begin
-    return 1e6 * least(lambda: program(bare, effects, state))[0] / steps, compilation
+    given = bare, effects, state
+    if devices > 1:  # where the program wants them
+        given = jax.device_put(given, program.input_shardings[0])
+    taken = in_turn(lambda: program(*given), longest=SECONDS).min()
+    return 1e6 * float(taken) / steps, compilation
 
 
 def our_gradient(strands: int, points: int, solver: Any) -> tuple[float, float]:
@@ -86,11 +82,13 @@ def our_gradient(strands: int, points: int, solver: Any) -> tuple[float, float]:
         return jnp.sum(along * end.positions)
 
     gradient = jax.jit(jax.value_and_grad(loss))
-    forward, both = least(
+    taken = in_turn(
         lambda: phase_end(bare, effects, state, steps=STEPS, kernels=True),
         lambda: gradient(state.shapes),
+        longest=2 * SECONDS,
     )
-    return 1e6 * forward / STEPS, 1e6 * both / STEPS
+    forward, both = 1e6 * taken.min(axis=0) / STEPS
+    return float(forward), float(both)
 
 
 def printed(python: str, program: Path, options: list[str], pattern: str) -> float | None:
@@ -123,12 +121,16 @@ def steps(options: argparse.Namespace, strands: int, points: int) -> None:
                     base.setdefault(threads, taken)
                     print(f"  {name + f', {threads} threads':<34} {taken:9.1f}")
     for name, solver in SOLVERS.items():
-        for more, compiled in (("", {}), (", vectors of 512 bits", WIDTH)):
-            taken, compilation = ours(strands, points, solver, compiled)
+        for devices, wide in ((1, False), (2, False), (1, True), (2, True)):
+            if wide and name != "red-black":
+                continue
+            taken, compilation = ours(strands, points, solver, devices, WIDTH if wide else {})
             ratios = [f"{taken / x:5.2f} of numba on {n}" for n, x in base.items()]
+            title = f"{name}, {devices} devices" + ", 512 bits" * wide
             print(
-                f"  {name + more:<34} {taken:9.1f}  compiled in {compilation:4.1f} s  "
-                + "  ".join(ratios)
+                f"  {title:<34} {taken:9.1f}  compiled in {compilation:4.1f} s  "
+                + "  ".join(ratios),
+                flush=True,
             )
 
 
@@ -153,6 +155,7 @@ def main() -> None:
     parser.add_argument("--python", default=sys.executable, help="an interpreter with numba")
     parser.add_argument("--only", choices=("steps", "gradients"))
     options = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", 2)
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}; microseconds a step")
     for strands, points in SIZES if options.only != "gradients" else ():
         print(f"\n{strands:,} strands of {points} points")

@@ -4,7 +4,6 @@ Ratios of times within one run, taken in turn, float32, medians; compilation apa
 have the same physical fibre and hang from their roots.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from measure import in_turn
 
 import jaxhair as jh
 from jaxhair.simulate import phase_end, start
@@ -25,19 +25,6 @@ SOLVERS = {
     "direct": jh.Direct(),
     "direct, 2 Newton steps": jh.Direct(newton_steps=2),
 }
-
-
-def in_turn(runs: dict[str, Callable[[], Any]], times: int = 21) -> dict[str, np.ndarray]:
-    """Wall times [s] of calls that take turns, after one of each that compiles."""
-    for run in runs.values():
-        jax.block_until_ready(run())
-    taken: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(times):
-        for name, run in runs.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(run())
-            taken[name].append(time.perf_counter() - begin)
-    return {name: np.array(x) for name, x in taken.items()}
 
 
 def hair(strands: int, points: int) -> jh.Strands:
@@ -83,11 +70,10 @@ def main() -> None:
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}")
     print("\ntime of a step: us, and the median of the ratios to the paper's solver")
     for strands, points in SIZES:
-        runs = {name: steps(strands, points, solver, 50) for name, solver in SOLVERS.items()}
-        taken = in_turn(runs)
-        base = taken["paper's, 5 iterations"]
-        for name, x in taken.items():
-            ratio = np.median(x / base)
+        runs = [steps(strands, points, solver, 50) for solver in SOLVERS.values()]
+        taken = in_turn(*runs, times=21).T
+        for name, x in zip(SOLVERS, taken, strict=True):
+            ratio = np.median(x / taken[0])
             print(
                 f"  {strands:3d} x {points}  {name:<24} {1e6 * np.median(x) / 50:7.0f} {ratio:5.2f}"
             )
@@ -96,16 +82,15 @@ def main() -> None:
         shape, at = released(strands)
         jacobian = jax.jit(jax.jacfwd(shape))
         gradient = jax.jit(jax.grad(lambda x, shape=shape: jnp.sum(shape(x) ** 2)))
-        taken = in_turn(
-            {
-                "forward": lambda f=shape, at=at: f(at),
-                "Jacobian for 5 parameters": lambda f=jacobian, at=at: f(at),
-                "reverse-mode gradient": lambda f=gradient, at=at: f(at),
-            },
+        forward, *derivatives = in_turn(
+            lambda f=shape, at=at: f(at),
+            lambda f=jacobian, at=at: f(at),
+            lambda f=gradient, at=at: f(at),
             times=11,
-        )
-        for name, x in list(taken.items())[1:]:
-            print(f"  {strands:3d} strands  {name:<26} {np.median(x / taken['forward']):5.2f}")
+        ).T
+        names = ("Jacobian for 5 parameters", "reverse-mode gradient")
+        for name, x in zip(names, derivatives, strict=True):
+            print(f"  {strands:3d} strands  {name:<26} {np.median(x / forward):5.2f}")
 
 
 if __name__ == "__main__":
