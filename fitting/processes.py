@@ -10,17 +10,22 @@ from jax.experimental import multihost_utils
 Arrays = TypeVar("Arrays", bound=NamedTuple)
 
 
-def shared(evaluate: Callable[[np.ndarray], Arrays], strands: np.ndarray) -> Arrays:
+def shared(
+    evaluate: Callable[[np.ndarray], Arrays], strands: np.ndarray, *, together: int
+) -> Arrays:
     """evaluate(strands), of which every process evaluates its share.
 
     Arguments:
         evaluate: from places of strands to arrays whose first axis is theirs.
         strands: the same in all processes, which must all call.
+        together: strands that are evaluated at once, all of them by one process. A program may
+            round differently in each place (JAX 0.12), and so no strand's place may depend on the
+            number of processes.
     """
     processes = jax.process_count()
     if processes == 1:
         return evaluate(strands)
-    size = -(-len(strands) // processes)
+    size = -(-len(strands) // (processes * together)) * together
     places = size * jax.process_index() + np.arange(size)
     found = evaluate(strands[np.minimum(places, len(strands) - 1)])  # the last share is filled up
 

@@ -243,7 +243,8 @@ class Tiles:
         Arguments:
             x: free numbers, shape (strands, n). strands: their places in the scene.
         """
-        return shared(lambda few: self._evaluated(x[few], strands[few]), np.arange(len(strands)))
+        places = np.arange(len(strands))
+        return shared(lambda few: self._evaluated(x[few], strands[few]), places, together=self.tile)
 
     def _evaluated(self, x: np.ndarray, strands: np.ndarray) -> "Squares":
         """`evaluate` for a process's share.

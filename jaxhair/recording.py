@@ -204,7 +204,7 @@ def _frame(
         return lax.fori_loop(first, first + steps, one, (state, blank(setup, state)))[0]
 
     with allowed():
-        state = tiles.spread(advanced, setup, state, first, steps)
+        state = tiles.in_shares(advanced, setup, state, first, steps)
     finite = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
     return state, observe(state), jnp.stack(finite).all()
 

@@ -216,7 +216,7 @@ def advance(setup: Setup, state: State, first: Array | int, *, steps: int) -> St
     advanced = partial(_advanced, steps=steps)
     if steps == 1 and setup.devices == 1:  # one step for each tile gains nothing
         return advanced(setup, state, jnp.asarray(first))
-    return tiles.spread(advanced, setup, state, jnp.asarray(first))
+    return tiles.in_shares(advanced, setup, state, jnp.asarray(first))
 
 
 FEW = 64

@@ -82,7 +82,7 @@ def tiling(strands: int, points: int, numbers: int = 0) -> tuple[int, int]:
     return tiles, -(-strands // (LANES * tiles)) * LANES
 
 
-def spread(
+def in_shares(
     advanced: Callable[..., "State"], setup: "Setup", state: "State", *shared: Array
 ) -> "State":
     """advanced(setup, state, *shared), on the setup's devices, on a CPU by tiles.

@@ -3,8 +3,7 @@
 PEERS is the folder of the peers' programs, each of which simulates the same scene: strands clamped
 at their roots, gravity, 5 iterations, a rest shape of four bonds, of which two kinds re-form.
 PYTHON is an interpreter that has numba, if this one does not. Microseconds a step, the least of
-many runs, float32, compilation apart; ratios to vectorised Numba. "512 bits" are the vectors that
-the compiler option `xla_cpu_prefer_vector_width` asks for, where a processor has them. Also a
+many runs, float32, compilation apart; ratios to vectorised Numba on as many threads. Also a
 reverse-mode gradient, forward run included, beside that of Warp's tape if PYTHON has warp-lang.
 """
 
@@ -15,6 +14,7 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ import jaxhair as jh
 from jaxhair.simulate import phase_end, start
 
 SIZES = ((200, 9), (100, 17), (10_000, 9), (1_000, 100))
-WIDTH = {"xla_cpu_prefer_vector_width": 512}
 SOLVERS = {
     "red-black": jh.PositionBased(),
     "sequential": jh.PositionBased(sweep="sequential"),
@@ -50,18 +49,13 @@ def scene(strands: int, points: int, solver: Any) -> jh.Scene:
     return jh.Scene(hair, bonds=bonds, phases=(jh.Phase("fall", 1.0, effects),), solver=solver)
 
 
-def ours(
-    strands: int, points: int, solver: Any, devices: int, options: dict[str, Any]
-) -> tuple[float, float]:
+def ours(strands: int, points: int, solver: Any, devices: int) -> tuple[float, float]:
     """Microseconds a step, and seconds of tracing and compiling."""
     built = scene(strands, points, solver).as_arrays()
     effects, state, bare = built.phases[0].effects, start(built), replace(built, phases=())
     steps = int(np.clip(400_000 / (strands * points), 20, 100))
     begin = time.perf_counter()
-    run = jax.jit(
-        lambda *x: phase_end(*x, steps=steps, devices=devices, kernels=True),
-        compiler_options=options,
-    )
+    run = jax.jit(partial(phase_end, steps=steps, devices=devices, kernels=True))
     program = run.lower(bare, effects, state).compile()
     compilation = time.perf_counter() - begin
     given = bare, effects, state
@@ -121,17 +115,11 @@ def steps(options: argparse.Namespace, strands: int, points: int) -> None:
                     base.setdefault(threads, taken)
                     print(f"  {name + f', {threads} threads':<34} {taken:9.1f}")
     for name, solver in SOLVERS.items():
-        for devices, wide in ((1, False), (2, False), (1, True), (2, True)):
-            if wide and name != "red-black":
-                continue
-            taken, compilation = ours(strands, points, solver, devices, WIDTH if wide else {})
-            ratios = [f"{taken / x:5.2f} of numba on {n}" for n, x in base.items()]
-            title = f"{name}, {devices} devices" + ", 512 bits" * wide
-            print(
-                f"  {title:<34} {taken:9.1f}  compiled in {compilation:4.1f} s  "
-                + "  ".join(ratios),
-                flush=True,
-            )
+        for devices in (1, 2):
+            taken, compilation = ours(strands, points, solver, devices)
+            ratio = f"  {taken / base[devices]:5.2f} of Numba's" if base else ""
+            title = f"{name}, {devices} devices"
+            print(f"  {title:<34} {taken:9.1f}{ratio}, compiled in {compilation:.1f} s", flush=True)
 
 
 def gradients(options: argparse.Namespace, strands: int, points: int) -> None:
