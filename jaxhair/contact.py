@@ -113,7 +113,8 @@ class HairContact(RememberingEffect):
 
     def _push(self, p: Array, start: Array, end: Array) -> Array:
         """(2r - D) / (2r) n of points from edges, each of shape (3, pairs)."""
-        rounding = 4 * np.finfo(p.dtype).eps * jnp.max(jnp.abs(p), axis=-2, keepdims=True)
+        x, y, z = quat.components(jnp.abs(p))
+        rounding = 4 * np.finfo(p.dtype).eps * jnp.maximum(jnp.maximum(x, y), z)
         along, p = stored(end - start), stored(p - start)
         square = quat.dot(along, along)
         place = jnp.clip(quat.dot(p, along) / jnp.where(square == 0, 1, square), 0, 1)

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxhair.sums import summed
+
 BLOCK = 32
 """Points in a block, and blocks in a group: the bits of a word, one for each edge of a block."""
 
@@ -87,7 +89,7 @@ def near_pairs(
     own = blocks(strands[None], -1)[0]
     of_points, of_edges = _box(p, p), _box(p, q)
     along = q - p
-    square = jnp.sum(along**2, axis=0, keepdims=True)
+    square = summed(along**2, 0)
     across = along / jnp.where(square == 0, 1, square)
     pairs_of_groups, many_groups = _listed(_near(_whole(of_points), _whole(of_edges), reach))
     at_once = min(batch.groups, groups**2)
@@ -110,8 +112,8 @@ def near_pairs(
             a, b = jnp.divmod(place, BLOCK)
             a, b = first[pair] * BLOCK + a, second[pair] * BLOCK + b
             apart = p[:, a, None] - p[:, b, :, None]  # (3, tiles, edges, points)
-            place = jnp.clip(jnp.sum(apart * across[:, b, :, None], axis=0, keepdims=True), 0, 1)
-            square = jnp.sum((apart - place * along[:, b, :, None]) ** 2, axis=0)
+            place = jnp.clip(summed(apart * across[:, b, :, None], 0), 0, 1)
+            square = summed((apart - place * along[:, b, :, None]) ** 2, 0)[0]
             near = (square < reach**2) & (own[a, None] != own[b, :, None])
             words = _words(near)
             words = jnp.where((number < many)[:, None], words, 0)
