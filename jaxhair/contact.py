@@ -11,7 +11,7 @@ from jax import Array, lax
 from jaxhair import check
 from jaxhair import quaternion as quat
 from jaxhair.effects import RememberingEffect
-from jaxhair.neighbours import batch_here, near_pairs
+from jaxhair.neighbours import batch_here, near_pairs, places
 from jaxhair.pytree import pytree, static
 from jaxhair.rods import Rod
 from jaxhair.stored import stored
@@ -30,6 +30,8 @@ class Lists:
     Arguments:
         points, edges: of `neighbours.Pairs` that were nearer than two radii and the skin when the
             lists were made, shape (chunks, pairs of a chunk). count: of such pairs, shape ().
+        order: of `neighbours.Pairs`: along it points of a chunk lie close together in memory, too.
+            back: the place in it of each point.
         skin: by how much hairs may have come nearer since [m], shape (); below 0 where there was no
             room even for what touched.
         positions: when the lists were made [m], shape (points, 3, strands).
@@ -39,6 +41,8 @@ class Lists:
     points: Array
     edges: Array
     count: Array
+    order: Array
+    back: Array
     skin: Array
     positions: Array
     builds: Array
@@ -93,22 +97,29 @@ class HairContact(RememberingEffect):
         from there. Where they coincide, to the rounding of positions, there is no direction, and
         no push. NaN everywhere if the lists do not hold.
         """
-        x = _flat(state.positions)
-        size, strands = x.shape[1], state.positions.shape[2]
+        x, strands, size = _flat(state.positions), state.positions.shape[2], len(memory.order)
+        starts, ends = (
+            stored(x.at[:, n].get(mode="clip")) for n in (memory.order, memory.order + strands)
+        )
 
-        def with_chunk(total: tuple[Array, ...], pairs: tuple[Array, Array]) -> tuple[Any, None]:
-            at, edge = pairs
-            p, start, end = (x.at[:, n].get(mode="clip") for n in (at, edge, edge + strands))
+        def added(total: tuple[Array, ...], at: Array, edge: Array) -> tuple[Array, ...]:
+            p, start, end = (
+                y.at[:, n].get(mode="clip") for y, n in ((starts, at), (starts, edge), (ends, edge))
+            )
             push = quat.components(stored(jnp.where(at < size, self._push(p, start, end), 0)))
             return tuple(
                 t.at[at].add(one[0], mode="drop") for t, one in zip(total, push, strict=True)
-            ), None
+            )
+
+        def with_chunk(total: tuple[Array, ...], pairs: tuple[Array, Array]) -> tuple[Any, None]:
+            at, edge = pairs  # those behind the last pair are left out
+            return lax.cond(at[0] < size, added, lambda total, *_: total, total, at, edge), None
 
         body = jax.checkpoint(with_chunk, prevent_cse=False)
-        total, _ = lax.scan(body, (jnp.zeros_like(x[0]),) * 3, (memory.points, memory.edges))
+        total, _ = lax.scan(body, (jnp.zeros_like(starts[0]),) * 3, (memory.points, memory.edges))
         holds = memory.hold(lax.stop_gradient(state.positions))
         pushed = self.strength * dt * jnp.where(holds, stored(jnp.stack(total)), jnp.nan)
-        pushed = jnp.moveaxis(pushed.reshape(3, -1, strands), 0, 1)
+        pushed = jnp.moveaxis(pushed[:, memory.back].reshape(3, -1, strands), 0, 1)
         return pushed if self.in_gradients else lax.stop_gradient(pushed)
 
     def _push(self, p: Array, start: Array, end: Array) -> Array:
@@ -129,10 +140,18 @@ class HairContact(RememberingEffect):
         points, _, strands = state.positions.shape
         room = points * strands * min(self.capacity, (points - 1) * max(strands - 1, 1))
         chunks = -(-room // batch_here().pushes)
-        none = jnp.full((chunks, -(-room // chunks)), points * strands, jnp.int32)
-        x = lax.stop_gradient(state.positions)
+        size = places(points * strands)
+        none = jnp.full((chunks, -(-room // chunks)), size, jnp.int32)
+        x, number = lax.stop_gradient(state.positions), jnp.arange(size, dtype=jnp.int32)
         return Lists(
-            none, none, jnp.int32(none.size + 1), -jnp.ones_like(x[0, 0, 0]), x, jnp.int32(0)
+            none,
+            none,
+            jnp.int32(none.size + 1),
+            number,
+            number[: points * strands],
+            -jnp.ones_like(x[0, 0, 0]),
+            x,
+            jnp.int32(0),
         )
 
     def remembered(self, rod: Rod, state: State, memory: Lists) -> Lists:
@@ -174,7 +193,13 @@ def _renewed(memory: Lists, rod: Rod, x: Array, radius: Array) -> Lists:
         at, edges = (numbers.reshape(memory.points.shape) for numbers in pairs[:2])
         none = (pairs.number > room) & (skin == 0)
         far = ~jnp.isfinite(reach**2)  # so large are positions that no distance can be told
-        lists = Lists(at, edges, pairs.number, jnp.where(none | far, -1, skin), x, builds)
+        back = (
+            jnp.zeros_like(memory.back)
+            .at[pairs.order]
+            .set(jnp.arange(len(pairs.order), dtype=jnp.int32), mode="drop")
+        )
+        kept = jnp.where(none | far, -1, skin)
+        lists = Lists(at, edges, pairs.number, pairs.order, back, kept, x, builds)
         smaller = skin * jnp.minimum(lists.fitting(), 0.7)
         return jnp.where(smaller < LEAST * edge, 0, smaller), lists
 

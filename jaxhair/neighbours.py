@@ -32,7 +32,7 @@ class Batch(NamedTuple):
     pushes: int
 
 
-IN_CACHE = Batch(1, 64, 512, 2**15)
+IN_CACHE = Batch(1, 64, 512, 2**13)
 """For a CPU, where a batch should stay in cache."""
 WIDE = Batch(128, 2**13, 2**17, 2**20)
 """For a GPU, where a batch should fill the device: on an H200 the contact of 20,000 strands takes
@@ -48,14 +48,21 @@ def batch_here() -> Batch:
 class Pairs(NamedTuple):
     """Pairs of a point and an edge that are near each other, in no particular order.
 
-    points, edges: numbers of the points and of the points where the edges start, shape (capacity,);
-        behind the last pair, the number of points, which is no point.
+    points, edges: places, along the curve, of the points and of the points where the edges start,
+        shape (capacity,); behind the last pair, the number of places, which is no place.
     number: of pairs that are near, also of those that found no room, shape ().
+    order: the point at each place, shape (places,); behind the last one, the number of points.
     """
 
     points: Array
     edges: Array
     number: Array
+    order: Array
+
+
+def places(points: int) -> int:
+    """Places along the curve that some points have in whole groups of blocks."""
+    return -(-points // BLOCK**2) * BLOCK**2
 
 
 def near_pairs(
@@ -78,8 +85,8 @@ def near_pairs(
     batch = batch or batch_here()
     size = starts.shape[1]
     order = jnp.argsort(_along_the_curve(starts)).astype(jnp.int32)
-    groups = -(-size // BLOCK**2)
-    order = jnp.pad(order, (0, groups * BLOCK**2 - size), constant_values=size)
+    groups = places(size) // BLOCK**2
+    order = jnp.pad(order, (0, places(size) - size), constant_values=size)
 
     def blocks(x: Array, nothing: Any) -> Array:
         """(components, points) to (components, blocks, block)."""
@@ -118,17 +125,17 @@ def near_pairs(
             near = (square < reach**2) & (own[a, None] != own[b, :, None])
             words = _words(near)
             words = jnp.where((number < many)[:, None], words, 0)
-            return done + blocks_at_once, _with(found, words, a, b, order, batch.pairs)
+            return done + blocks_at_once, _with(found, words, a, b, batch.pairs)
 
         start = jnp.zeros_like(many), found
         return lax.while_loop(lambda carry: carry[0] < many, some, start)[1]
 
-    none = jnp.full(capacity + batch.pairs, size, jnp.int32)
-    found = Pairs(none, none, jnp.zeros((), jnp.int32))
+    none = jnp.full(capacity + batch.pairs, len(order), jnp.int32)
+    found = Pairs(none, none, jnp.zeros((), jnp.int32), order)
     found = lax.fori_loop(0, -(-many_groups // at_once), of_groups, found)
     inside = jnp.arange(capacity, dtype=jnp.int32) < found.number
-    points, edges = (jnp.where(inside, x[:capacity], size) for x in found[:2])
-    return Pairs(points, edges, found.number)
+    points, edges = (jnp.where(inside, x[:capacity], len(order)) for x in found[:2])
+    return Pairs(points, edges, found.number, order)
 
 
 def _listed(true: Array) -> tuple[Array, Array]:
@@ -215,7 +222,7 @@ def _words(true: Array) -> Array:
     return jnp.sum(jnp.where(true, bits[None, :, None], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
-def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array, at_once: int) -> Pairs:
+def _with(found: Pairs, words: Array, a: Array, b: Array, at_once: int) -> Pairs:
     """With the pairs that words of bits (tiles, BLOCK) name, of points in blocks a, edges in b."""
     capacity = len(found.points) - at_once
     words = words.ravel()
@@ -231,13 +238,13 @@ def _with(found: Pairs, words: Array, a: Array, b: Array, order: Array, at_once:
         tile, point = jnp.divmod(word, BLOCK)
         edge = _bit(words[word], number - before)
         at = jnp.minimum(found.number + done, capacity)
-        points = lax.dynamic_update_slice(points, order[a[tile] * BLOCK + point], (at,))
-        edges = lax.dynamic_update_slice(edges, order[b[tile] * BLOCK + edge], (at,))
+        points = lax.dynamic_update_slice(points, a[tile] * BLOCK + point, (at,))
+        edges = lax.dynamic_update_slice(edges, b[tile] * BLOCK + edge, (at,))
         return done + at_once, points, edges
 
     carry = jnp.zeros((), jnp.int32), found.points, found.edges
     _, points, edges = lax.while_loop(lambda carry: carry[0] < many, some, carry)
-    return Pairs(points, edges, found.number + many)
+    return Pairs(points, edges, found.number + many, found.order)
 
 
 def _bit(word: Array, number: Array) -> Array:

@@ -68,7 +68,8 @@ def listed(state: State, strands: Any) -> Lists:
         for x in (at, edges)
     )
     x, number = state.positions, jnp.int32(at.size - left)
+    order = jnp.arange(points * count, dtype=jnp.int32)
     return Lists(
-        at.reshape(-1, CHUNK), edges.reshape(-1, CHUNK), number, jnp.full((), jnp.inf, x.dtype), x,
-        jnp.int32(1),
+        at.reshape(-1, CHUNK), edges.reshape(-1, CHUNK), number, order, order,
+        jnp.full((), jnp.inf, x.dtype), x, jnp.int32(1),
     )  # fmt: skip

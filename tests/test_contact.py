@@ -126,8 +126,8 @@ def test_pairs_are_those_of_a_search_by_brute_force(reach: float, batch: Batch) 
     given = (jnp.asarray(x) for x in (starts, ends, strands, reach))
     found = near_pairs(*given, room, batch)
     assert int(found.number) == near.sum()
-    places = np.stack([found.points, found.edges])[:, : near.sum()]
-    np.testing.assert_array_equal(np.unique(places, axis=1), np.argwhere(near).T)
+    pairs = np.asarray(found.order)[np.stack([found.points, found.edges])[:, : near.sum()]]
+    np.testing.assert_array_equal(np.unique(pairs, axis=1), np.argwhere(near).T)
 
 
 def test_the_curve_visits_every_place_in_steps_of_one() -> None:
