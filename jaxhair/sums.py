@@ -40,14 +40,19 @@ def spread(x: Array, size: int, axis: int = COMPONENTS) -> Array:
     """
     if not ONE_BY_ONE:
         return _everywhere(x, size=size, axis=axis)
-    every: Array = _spread.bind(jnp.asarray(x), size=size, axis=axis)
+    every: Array = _spread.bind(jnp.asarray(x), size=size, axis=_from_the_end(x, axis))
     return every
 
 
 def one_by_one(x: Array, axis: int = COMPONENTS) -> Array:
     """`summed`, added one by one on a CPU; its derivatives are those of a sum."""
-    total: Array = _one_by_one.bind(jnp.asarray(x), axis=axis)
+    total: Array = _one_by_one.bind(jnp.asarray(x), axis=_from_the_end(x, axis))
     return total
+
+
+def _from_the_end(x: Array, axis: int) -> int:
+    """The axis as a number below 0, which it keeps where `jax.vmap` puts others before it."""
+    return axis % x.ndim - x.ndim
 
 
 def _sized(x: Any, size: int, axis: int) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ import pytest
 from jaxhair import quaternion as quat
 from jaxhair.kernels import allowed
 from jaxhair.stored import once, stored
+from jaxhair.sums import ONE_BY_ONE
 
 X = np.linspace(0.1, 1.5, 12).reshape(3, 4)
 
@@ -64,7 +65,7 @@ def products(q: Any, r: Any, keep: Any) -> Any:
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="other platforms choose by themselves")
 @pytest.mark.parametrize("derived", [lambda f: f, jax.grad], ids=["value", "gradient"])
 def test_compiled_programs_store(derived: Any) -> None:
-    """XLA has inlined none of the calls."""
+    """XLA has inlined none of the calls. Sums have calls of their own with JAX 0.12."""
     rng = np.random.default_rng(0)
     q, r = (quat.unit(jnp.asarray(rng.normal(size=(5, 4, 7)), jnp.float32)) for _ in range(2))
 
@@ -73,8 +74,9 @@ def test_compiled_programs_store(derived: Any) -> None:
         return jax.jit(function).lower(q, r).compile().as_text()
 
     times = 8 if derived is not jax.grad else 16  # and once more each cotangent
-    assert compiled(stored).count(" call(") == times
-    assert " call(" not in compiled(lambda x: x)
+    of_sums = compiled(lambda x: x).count(" call(")
+    assert (of_sums > 0) == ONE_BY_ONE
+    assert compiled(stored).count(" call(") == times + of_sums
 
 
 def test_kernels_store_by_themselves() -> None:

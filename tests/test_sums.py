@@ -52,7 +52,7 @@ def with_every_version(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=["value", "jvp", "grad", "hessian", "vmap", "vmap of grad", "grad of vmap"],
 )
-@pytest.mark.parametrize("axis", [COMPONENTS, POINTS])
+@pytest.mark.parametrize("axis", [COMPONENTS, POINTS, 1])
 @pytest.mark.parametrize(
     ("ours", "plain"), [(one_by_one, plain_sum), (spread, plain_spread)], ids=["summed", "spread"]
 )
