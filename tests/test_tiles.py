@@ -149,8 +149,9 @@ def test_scenes_side_by_side() -> None:
         return jnp.min(end(replace(made, bonds=jh.Bonds((1.0, rate, 1.0, 1.0)))).positions[:, 2])
 
     rates = jnp.array([0.2, 0.5])
-    along = jax.jvp(jax.vmap(lowest), (rates,), (jnp.ones(2),))
-    each = [jax.jvp(lowest, (rate,), (jnp.ones(()),)) for rate in rates]
+    along = jax.jit(lambda x: jax.jvp(jax.vmap(lowest), (x,), (jnp.ones(2),)))(rates)
+    one = jax.jit(lambda x: jax.jvp(lowest, (x,), (jnp.ones(()),)))
+    each = [one(rate) for rate in rates]
     assert np.allclose(along, np.array(each).T, rtol=1e-9, atol=1e-15)
 
 
