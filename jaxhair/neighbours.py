@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxhair.stored import stored
 from jaxhair.sums import summed
 
 BLOCK = 32
@@ -145,8 +144,7 @@ def _listed(true: Array) -> tuple[Array, Array]:
     numbers = jnp.arange(true.size, dtype=jnp.int32)
     # as `jnp.nonzero` finds them, which takes twice as long to compile
     to = jnp.where(true, ends - 1, true.size)
-    places = jnp.zeros_like(ends).at[to].set(numbers, mode="drop")
-    return places, ends[-1]
+    return jnp.zeros_like(ends).at[to].set(numbers, mode="drop"), ends[-1]
 
 
 def _along_the_curve(points: Array) -> Array:
@@ -175,7 +173,7 @@ def _along_the_curve(points: Array) -> Array:
     flipped = z >> 1  # a bit of it is whether the higher ones of z that are set are odd in number
     for shift in (1, 2, 4, 8):
         flipped = flipped ^ (flipped >> shift)
-    bits = stored(jnp.stack([x, y, z]) ^ flipped[None])
+    bits = jnp.stack([x, y, z]) ^ flipped[None]
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         bits = (bits | (bits << shift)) & mask
     return (bits[0] << 2) | (bits[1] << 1) | bits[2]

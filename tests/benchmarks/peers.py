@@ -117,7 +117,7 @@ def steps(options: argparse.Namespace, strands: int, points: int) -> None:
     for name, solver in SOLVERS.items():
         for devices in (1, 2):
             taken, compilation = ours(strands, points, solver, devices)
-            ratio = f"  {taken / base[devices]:5.2f} of Numba's" if base else ""
+            ratio = f"  {taken / base[devices]:5.2f} of Numba's" if devices in base else ""
             title = f"{name}, {devices} devices"
             print(f"  {title:<34} {taken:9.1f}{ratio}, compiled in {compilation:.1f} s", flush=True)
 
