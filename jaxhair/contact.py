@@ -193,13 +193,8 @@ def _renewed(memory: Lists, rod: Rod, x: Array, radius: Array) -> Lists:
         at, edges = (numbers.reshape(memory.points.shape) for numbers in pairs[:2])
         none = (pairs.number > room) & (skin == 0)
         far = ~jnp.isfinite(reach**2)  # so large are positions that no distance can be told
-        back = (
-            jnp.zeros_like(memory.back)
-            .at[pairs.order]
-            .set(jnp.arange(len(pairs.order), dtype=jnp.int32), mode="drop")
-        )
         kept = jnp.where(none | far, -1, skin)
-        lists = Lists(at, edges, pairs.number, pairs.order, back, kept, x, builds)
+        lists = Lists(at, edges, pairs.number, pairs.order, memory.back, kept, x, builds)
         smaller = skin * jnp.minimum(lists.fitting(), 0.7)
         return jnp.where(smaller < LEAST * edge, 0, smaller), lists
 
@@ -211,7 +206,10 @@ def _renewed(memory: Lists, rod: Rod, x: Array, radius: Array) -> Lists:
     skin = jnp.clip(skin, LEAST * edge, edge / 2)  # boxes around edges are no smaller
     skin = jnp.where(memory.builds == 0, edge / 4, skin)
     untried = replace(memory, count=jnp.int32(room + 1), skin=jnp.zeros_like(skin))
-    return lax.while_loop(too_many, tried, (skin, untried))[1]
+    lists = lax.while_loop(too_many, tried, (skin, untried))[1]
+    every = jnp.arange(len(lists.order), dtype=jnp.int32)
+    back = jnp.zeros_like(lists.back).at[lists.order].set(every, mode="drop")
+    return replace(lists, back=back)
 
 
 def _flat(x: Array) -> Array:
