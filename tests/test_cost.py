@@ -18,7 +18,7 @@ from jax import lax
 import jaxhair as jh
 from jaxhair import bonds, rods
 from jaxhair.__main__ import main
-from jaxhair.cost import Part, PhaseCost, SceneCost, measured, operations, table
+from jaxhair.cost import Part, PhaseCost, SceneCost, measured, measuring, operations, table
 from jaxhair.cost.parts import ELASTICITY, ITSELF, REST_SHAPE, plan
 from jaxhair.quaternion import from_vector_part
 from jaxhair.simulate import advance, phase_end, prepare, start
@@ -200,6 +200,35 @@ def test_effects_of_one_class_and_a_pose() -> None:
     assert parts["Wound"] > 0.5 * whole
     assert parts["Cut"] > 0
     assert sum(parts.values()) == pytest.approx(whole, rel=0.02)
+
+
+@pytest.mark.parametrize("touching", [True, False])
+def test_with_hair_contact_each_phase_is_measured_from_its_own_start(
+    touching: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without it phases of the same effects are measured once, from the scene's start."""
+    given = []
+
+    def noted(bench: Any, scene: jh.Scene, phases: Any, gradients: bool) -> None:
+        given.append(([phase.name for phase in phases], bench.state))
+
+    monkeypatch.setattr(measuring, "_phase_cost", noted)
+    effects = (*HELD, jh.HairContact(0.02)) if touching else HELD
+    scene = scene_of(effects, effects, solver=jh.PositionBased(iterations=1))
+    measured(scene)
+    names, states = zip(*given, strict=True)
+    assert names == ((["phase 0"], ["phase 1"]) if touching else (["phase 0", "phase 1"],))
+    assert np.array_equal(states[0].points, scene.strands.positions)
+    if touching:
+        end = jh.run(scene)["phase 0"].points
+        np.testing.assert_allclose(states[1].points, end, atol=1e-6)
+        assert np.max(np.abs(end - states[0].points)) > 1e-4  # it moved
+
+
+def test_a_scene_that_breaks_is_not_measured() -> None:
+    crowded = (*HELD, jh.HairContact(1.0, capacity=1))
+    with pytest.raises(jh.NotFinite, match="set it to"):
+        measured(scene_of(crowded, HELD), steps=1, repeat=1)
 
 
 def test_the_dearest_effect_is_left_out_before_the_others() -> None:

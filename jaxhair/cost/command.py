@@ -24,8 +24,9 @@ def parser() -> Parser:
         "python -m jaxhair cost",
         "Measures time, floating-point operations, memory and compilation of one time step in "
         "each phase of a scene, with and without each effect, the bonds' rest shape and the "
-        "solver, and prints what each adds. Phases with the same kinds of effects are measured "
-        "once. Nothing else should run meanwhile.",
+        "solver, and prints what each adds. With hair contact the scene is simulated first, and "
+        "each phase measured from its own start; without, phases with the same kinds of effects "
+        "are measured once. Nothing else should run meanwhile.",
         [
             "python -m jaxhair cost bed-hair --output cost",
             "python -m jaxhair cost perm --no-contact --solver direct --json",

@@ -6,14 +6,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxhair import check
 from jaxhair.cost.parts import Plan, Variant, plan
 from jaxhair.progress import each
+from jaxhair.recording import simulate
 from jaxhair.scene import Phase, Scene
 from jaxhair.simulate import phase_end, start
 from jaxhair.strands import State
+from jaxhair.tiles import couples
 
 BAR = 0.15
 """Within this part of it, the parts must add up to the measured whole."""
@@ -43,7 +46,7 @@ class Part:
 
 @dataclass(frozen=True)
 class PhaseCost:
-    """Cost of a step in phases that have the same kinds of effects; the first was measured.
+    """Cost of a step in phases that were measured as one, the first.
 
     Arguments:
         phases: their names. steps: of all of them.
@@ -134,9 +137,11 @@ def measured(
     """Time, operations and memory of a step of each phase, and what each part adds to them.
 
     A part's cost is the step's with it less the step's without it. Each is a compiled loop of
-    steps; the loops of a phase take turns, and of each the fastest of several calls counts. All
-    start from the scene's first state: where hair is matters to none but `HairContact`, whose
-    pushes and search for neighbours take longer in denser hair.
+    steps; the loops of a phase take turns, and of each the fastest of several calls counts.
+    Hair against hair takes longer where hair is denser or moves faster: a scene with an effect
+    that couples strands is simulated first, and each phase measured from its own start. Otherwise
+    where hair is changes no time: all start from the scene's first state, and phases with the
+    same kinds of effects are measured once.
 
     Arguments:
         steps: of a loop.
@@ -145,7 +150,8 @@ def measured(
         gradients: measure derivatives of the whole too.
         progress: show a progress bar on stderr.
 
-    Raises ValueError for a scene without phases.
+    Raises ValueError for a scene without phases, and NotFinite where simulating it gives values
+    that are NaN or infinite.
     """
     check.instance("scene", scene, Scene)
     check.whole("steps", steps, least=1, most=100_000)
@@ -155,28 +161,44 @@ def measured(
     if not scene.phases:
         raise ValueError("scene.phases is (); it must have at least one phase")
     numbers = scene.as_arrays()
-    state = start(numbers)
-    bare = replace(numbers, phases=())
-    bench = _Bench(state, steps, repeat, {})
+    coupled = any(couples(phase.effects) is not None for phase in numbers.phases)
+    groups = [(phase,) for phase in numbers.phases] if coupled else _alike(numbers.phases)
+    states = _starts(numbers, progress) if coupled else [start(numbers)] * len(groups)
+    bare, programs = replace(numbers, phases=()), dict[Any, _Program]()
     costs = tuple(
-        _phase_cost(bench, bare, phases, gradients)
-        for phases in each(
-            _alike(numbers.phases),
+        _phase_cost(_Bench(state, steps, repeat, programs), bare, phases, gradients)
+        for phases, state in each(
+            list(zip(groups, states, strict=True)),
             "measuring",
             unit="phase",
             shown=progress,
-            said=lambda phases: phases[0].name,
+            said=lambda of: of[0][0].name,
         )
     )
     return SceneCost(scene, costs, steps, repeat)
 
 
-def _alike(phases: Sequence[Phase]) -> list[list[Phase]]:
+def _alike(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
     """Phases by the classes of their effects."""
-    groups: dict[tuple[type, ...], list[Phase]] = {}
+    groups: dict[tuple[type, ...], tuple[Phase, ...]] = {}
     for phase in phases:
-        groups.setdefault(tuple(type(e) for e in phase.effects), []).append(phase)
+        kind = tuple(type(e) for e in phase.effects)
+        groups[kind] = (*groups.get(kind, ()), phase)
     return list(groups.values())
+
+
+def _starts(scene: Scene, progress: bool) -> list[State]:
+    """The state that each phase starts from."""
+    longest = max(phase.steps(scene.dt) for phase in scene.phases)
+    rare = 0.5 / (longest * scene.dt)  # frames a second: only at the ends of phases
+    before = replace(scene, phases=scene.phases[:-1])
+    recording = simulate(before, fps=rare, observe=lambda state: state, progress=progress)
+    if not recording.complete:
+        raise KeyboardInterrupt
+    of_phase = [
+        jax.tree.map(lambda x, i=i: x[i], recording.observed) for i in range(len(scene.phases))
+    ]
+    return jax.tree.map(jnp.asarray, of_phase)
 
 
 @dataclass(frozen=True)
