@@ -162,7 +162,7 @@ def measured(
         raise ValueError("scene.phases is (); it must have at least one phase")
     numbers = scene.as_arrays()
     coupled = any(couples(phase.effects) is not None for phase in numbers.phases)
-    groups = [(phase,) for phase in numbers.phases] if coupled else _alike(numbers.phases)
+    groups = [[phase] for phase in numbers.phases] if coupled else _alike(numbers.phases)
     states = _starts(numbers, progress) if coupled else [start(numbers)] * len(groups)
     bare, programs = replace(numbers, phases=()), dict[Any, _Program]()
     costs = tuple(
@@ -178,17 +178,20 @@ def measured(
     return SceneCost(scene, costs, steps, repeat)
 
 
-def _alike(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
+def _alike(phases: Sequence[Phase]) -> list[list[Phase]]:
     """Phases by the classes of their effects."""
-    groups: dict[tuple[type, ...], tuple[Phase, ...]] = {}
+    groups: dict[tuple[type, ...], list[Phase]] = {}
     for phase in phases:
-        kind = tuple(type(e) for e in phase.effects)
-        groups[kind] = (*groups.get(kind, ()), phase)
+        groups.setdefault(tuple(type(e) for e in phase.effects), []).append(phase)
     return list(groups.values())
 
 
 def _starts(scene: Scene, progress: bool) -> list[State]:
-    """The state that each phase starts from."""
+    """The state that each phase starts from.
+
+    By `simulate` and not by `run`, which compiles a program for each number of steps, shows no
+    progress and does not tell of NaN.
+    """
     longest = max(phase.steps(scene.dt) for phase in scene.phases)
     rare = 0.5 / (longest * scene.dt)  # frames a second: only at the ends of phases
     before = replace(scene, phases=scene.phases[:-1])
@@ -216,7 +219,7 @@ class _Bench:
 
     Arguments:
         state: before the first step. steps: of a loop. repeat: most calls of it.
-        programs: compiled so far, by the structure and shapes of their arguments.
+        programs: compiled so far, by what they compute and their arguments' structure and shapes.
     """
 
     state: State
@@ -225,21 +228,21 @@ class _Bench:
     programs: dict[Any, _Program]
 
     def program(self, variant: Variant) -> _Program:
-        leaves, tree = jax.tree.flatten((variant.scene, variant.effects))
-        key = tree, tuple(np.shape(leaf) for leaf in leaves)
-        if key not in self.programs:
-            self.programs[key] = self.compiled(
-                phase_end.lower, variant, steps=self.steps, kernels=True
-            )
-        return self.programs[key]
+        return self.compiled("steps", phase_end.lower, variant, steps=self.steps, kernels=True)
 
-    def compiled(self, lower: Callable[..., Any], variant: Variant, **options: int) -> _Program:
-        begin = time.perf_counter()
-        program = lower(variant.scene, variant.effects, self.state, **options).compile()
-        taken = time.perf_counter() - begin
-        analysis = program.memory_analysis()
-        memory = None if analysis is None else int(analysis.temp_size_in_bytes)
-        return _Program(program, memory, taken)
+    def compiled(
+        self, name: str, lower: Callable[..., Any], variant: Variant, **options: int
+    ) -> _Program:
+        leaves, tree = jax.tree.flatten((variant.scene, variant.effects))
+        key = name, tree, tuple(np.shape(leaf) for leaf in leaves)
+        if key not in self.programs:
+            begin = time.perf_counter()
+            program = lower(variant.scene, variant.effects, self.state, **options).compile()
+            taken = time.perf_counter() - begin
+            analysis = program.memory_analysis()
+            memory = None if analysis is None else int(analysis.temp_size_in_bytes)
+            self.programs[key] = _Program(program, memory, taken)
+        return self.programs[key]
 
     def seconds(self, calls: dict[str, tuple[_Program, Variant]]) -> dict[str, float]:
         """Shortest time of a step of each program, but for the first call; they take turns."""
@@ -270,7 +273,7 @@ class _Bench:
             return jax.grad(lambda *x: end(*x).positions.mean(), argnums=(0, 1))(*arguments)
 
         return {
-            name: (self.compiled(jax.jit(function).lower, variant), variant)
+            name: (self.compiled(name, jax.jit(function).lower, variant), variant)
             for name, function in (("forward mode", forward), ("reverse mode", reverse))
         }
 
